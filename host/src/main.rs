@@ -1,0 +1,2 @@
+//! The `daic` program.
+fn main() {}

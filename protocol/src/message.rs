@@ -1,0 +1,423 @@
+//! Requests, replies and events.
+//!
+//! Append-only enums: a variant never changes its place or its fields; `tests/golden.rs` pins the
+//! bytes of each.
+
+use crate::limits::{CHUNK_LEN, EVENTS_PER_REPLY};
+use heapless::{String, Vec};
+use serde::{Deserialize, Serialize};
+
+/// From host to box. The frame header carries the request id.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Request {
+    /// Who are you? Frozen for ever.
+    Hello,
+    /// State, position, program, counters.
+    Status,
+    /// Start staging a program of `length` bytes; drops an earlier unfinished staging.
+    LoadBegin {
+        /// Encoded length in bytes.
+        length: u32,
+    },
+    /// The bytes at `index * CHUNK_LEN`; chunks may come in any order, each exactly once or repeated identically.
+    LoadChunk {
+        /// Chunk number from 0.
+        index: u16,
+        /// [`CHUNK_LEN`] bytes, fewer only in the last chunk.
+        data: Vec<u8, CHUNK_LEN>,
+    },
+    /// Validate what was staged; only a valid program replaces the old one.
+    LoadCommit {
+        /// Must equal that of `LoadBegin`.
+        length: u32,
+        /// CRC-32 (ISO-HDLC) over the encoded program.
+        hash: u32,
+    },
+    /// Forget what was staged.
+    LoadAbort,
+    /// Make the committed program ready.
+    Arm {
+        /// Must be the hash of the committed program.
+        hash: u32,
+    },
+    /// Play the armed program from its first instruction.
+    Start,
+    /// End after the current instruction, outputs safe, position known.
+    Stop,
+    /// Outputs safe now. Position stays known (steps made are counted).
+    Abort,
+    /// Leave the faulted state.
+    ClearFault,
+    /// Events from `from` on.
+    ReadEvents {
+        /// Sequence number of the first event wanted.
+        from: u32,
+    },
+    /// One clock sample; the reply carries the tick at which the request was received.
+    Clock,
+}
+
+/// From box to host. The frame header carries the id of the request answered.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Reply {
+    /// Answer to `Hello`.
+    Hello(Hello),
+    /// Answer to `Status`.
+    Status(Status),
+    /// The request has been carried out (or, for `Start`, accepted).
+    Done {
+        /// State after the request.
+        state: State,
+    },
+    /// The request was refused and had no effect.
+    Refused(Refusal),
+    /// Answer to `ReadEvents`.
+    Events(Events),
+    /// Answer to `Clock`.
+    Clock {
+        /// Tick at which the request's last byte was received.
+        tick: u64,
+    },
+}
+
+/// What the box is and can do. **Frozen for ever**: a host of any version can read it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Hello {
+    /// Always [`Hello::MAGIC`]: tells the box from any other thing on a serial port.
+    pub magic: u32,
+    /// [`PROTOCOL_VERSION`](crate::limits::PROTOCOL_VERSION) of the box.
+    pub protocol: u16,
+    /// Hash over the golden bytes of all messages; differs when the messages differ.
+    pub schema: u32,
+    /// Firmware version, "major.minor.patch".
+    pub firmware: String<16>,
+    /// Board name.
+    pub board: String<16>,
+    /// Drawn anew at every boot: a change means the box was reset.
+    pub boot_id: u32,
+    /// Ticks per second.
+    pub tick_hz: u32,
+    /// Bits of [`Capabilities`].
+    pub capabilities: u32,
+    /// Number of LEDs, cameras, axes, trigger inputs.
+    pub leds: u8,
+    /// Number of camera trigger lines.
+    pub cameras: u8,
+    /// Number of stage axes.
+    pub axes: u8,
+    /// Number of trigger inputs.
+    pub inputs: u8,
+    /// Largest encoded program in bytes.
+    pub max_program_bytes: u32,
+    /// Largest number of instructions.
+    pub max_instructions: u16,
+    /// Events kept for re-reading.
+    pub event_ring: u16,
+    /// Smallest distance between two words in ticks.
+    pub min_step_ticks: u32,
+}
+
+impl Hello {
+    /// "daic" in ASCII, big end first.
+    pub const MAGIC: u32 = 0x6461_6963;
+}
+
+/// Bits of [`Hello::capabilities`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Capabilities;
+impl Capabilities {
+    /// The box is a simulation.
+    pub const SIMULATED: u32 = 1;
+    /// `WaitTrigger` is played.
+    pub const TRIGGER_INPUTS: u32 = 2;
+    /// Moves may be limited in jerk.
+    pub const JERK: u32 = 4;
+    /// Programs longer than memory can be streamed.
+    pub const STREAMING: u32 = 8;
+    /// Programs can be stored in flash.
+    pub const FLASH: u32 = 16;
+}
+
+/// State of the controller.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum State {
+    /// No program committed.
+    Empty,
+    /// A valid program is committed.
+    Loaded,
+    /// Ready to start.
+    Armed,
+    /// Playing.
+    Running,
+    /// Ended in a fault, outputs safe; only `ClearFault` leaves this state.
+    Faulted,
+}
+
+/// Answer to `Status`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Status {
+    /// State now.
+    pub state: State,
+    /// Tick now.
+    pub tick: u64,
+    /// Boot id, as in `Hello`.
+    pub boot_id: u32,
+    /// Hash of the committed program, if any.
+    pub program: Option<u32>,
+    /// Position of each axis in steps.
+    pub position: [i32; 6],
+    /// Sequence number the next event will get.
+    pub next_event: u32,
+    /// Number of the run since boot (0 = none yet).
+    pub run: u32,
+    /// Index of the instruction being played.
+    pub instruction: u16,
+    /// Fault, if the state is `Faulted`.
+    pub fault: Option<Fault>,
+    /// Frames rejected since boot, by cause.
+    pub rejected: Rejected,
+}
+
+/// Frames that were received and rejected, by cause.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Rejected {
+    /// Longer than the longest frame.
+    pub oversized: u32,
+    /// Not COBS.
+    pub cobs: u32,
+    /// Length differs from that in the header.
+    pub length: u32,
+    /// CRC wrong.
+    pub crc: u32,
+    /// CRC right, but of another version or not a request.
+    pub header: u32,
+    /// CRC right, but the body does not decode or leaves bytes over.
+    pub body: u32,
+}
+
+/// Why a request was refused. The request had no effect.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Refusal {
+    /// Not possible in this state.
+    WrongState {
+        /// State of the box.
+        state: State,
+    },
+    /// Longer than the box can hold.
+    ProgramTooLong {
+        /// Bytes announced.
+        length: u32,
+        /// Bytes that fit.
+        max: u32,
+    },
+    /// Chunk number or chunk length does not fit the announced length.
+    BadChunk {
+        /// Chunk number.
+        index: u16,
+        /// Bytes received.
+        length: u16,
+        /// Bytes expected (0: no such chunk).
+        expected: u16,
+    },
+    /// A chunk was repeated with other content.
+    ChunkChanged {
+        /// Chunk number.
+        index: u16,
+    },
+    /// Commit before all chunks were there.
+    ChunkMissing {
+        /// First missing chunk.
+        index: u16,
+    },
+    /// Nothing is being staged.
+    NotStaging,
+    /// Length of commit differs from that of begin.
+    LengthDiffers {
+        /// Of begin.
+        begun: u32,
+        /// Of commit.
+        committed: u32,
+    },
+    /// Hash of what was received (or committed) differs from that of the request.
+    HashDiffers {
+        /// Computed by the box.
+        computed: u32,
+        /// In the request.
+        given: u32,
+    },
+    /// The program is not valid.
+    Invalid(Violation),
+    /// A request id was used again for another request.
+    IdReused,
+}
+
+/// Which rule a program breaks, where, and by how much.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Violation {
+    /// Index of the instruction.
+    pub instruction: u16,
+    /// The rule.
+    pub rule: Rule,
+    /// Offending value.
+    pub value: i64,
+    /// Limit it breaks.
+    pub limit: i64,
+}
+
+/// Rules of the verifier. Append-only.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Rule {
+    /// The bytes do not decode to an instruction (`value` = byte offset).
+    Undecodable,
+    /// More instructions than fit.
+    TooManyInstructions,
+    /// Program without instructions.
+    EmptyProgram,
+    /// Edge drives bits that it may not (`value` = mask).
+    ForbiddenBits,
+    /// Edge sets bits outside its mask (`value` = value).
+    ValueOutsideMask,
+    /// Two words closer than the player can do (`value` = ticks).
+    StepTooShort,
+    /// Loop count is zero.
+    ZeroLoop,
+    /// Loop end without begin.
+    UnmatchedLoopEnd,
+    /// Loop begin without end.
+    UnclosedLoop,
+    /// Loops nested too deep.
+    LoopTooDeep,
+    /// Loop whose body takes no time.
+    EmptyLoop,
+    /// No such axis.
+    NoSuchAxis,
+    /// No such LED.
+    NoSuchLed,
+    /// No such trigger input.
+    NoSuchInput,
+    /// Target beyond the soft limits.
+    TargetOutOfRange,
+    /// Step rate zero or beyond the axis.
+    RateOutOfRange,
+    /// Acceleration zero or beyond the axis.
+    AccelerationOutOfRange,
+    /// Not played by this firmware (see [`Capabilities`]).
+    Unsupported,
+    /// LED switched on before its level has settled (`value` = ticks since the level was set).
+    LevelNotSettled,
+    /// LED on longer than its longest pulse (`value` = ticks).
+    PulseTooLong,
+    /// Program longer than the tick counter allows.
+    TooLong,
+    /// An output is left on when the program ends (`value` = word); only a safe end is allowed.
+    LeftOn,
+}
+
+/// Why the box stopped by itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Fault {
+    /// Cause.
+    pub cause: FaultCause,
+    /// Tick at which outputs went safe.
+    pub tick: u64,
+    /// Instruction being played.
+    pub instruction: u16,
+}
+
+/// Cause of a fault. Append-only.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum FaultCause {
+    /// The host asked (`Abort`).
+    Aborted,
+    /// The player ran dry.
+    Underrun,
+    /// A committed program broke a rule at run time.
+    Internal,
+}
+
+/// Answer to `ReadEvents`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Events {
+    /// Sequence number of the oldest event still kept; larger than asked means events were lost.
+    pub oldest: u32,
+    /// Sequence number the next event will get.
+    pub next: u32,
+    /// Events overwritten since boot before anyone read them.
+    pub dropped: u32,
+    /// Events in order, from the one asked (or the oldest) on.
+    pub events: Vec<Event, EVENTS_PER_REPLY>,
+}
+
+/// Something that happened on the box.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Event {
+    /// Counts up by one, from 0 at boot.
+    pub seq: u32,
+    /// When, in ticks since boot.
+    pub tick: u64,
+    /// What.
+    pub kind: EventKind,
+}
+
+/// What happened. Append-only.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum EventKind {
+    /// A run began; its ticks count from here.
+    RunStarted {
+        /// Number of the run since boot.
+        run: u32,
+        /// Hash of the program.
+        program: u32,
+    },
+    /// Outputs other than step and direction changed.
+    Edge {
+        /// Bits that changed.
+        changed: u32,
+        /// The word after the change.
+        word: u32,
+    },
+    /// An LED level was set.
+    Level {
+        /// LED index.
+        led: u8,
+        /// Level.
+        level: u16,
+    },
+    /// A mark was passed.
+    Mark {
+        /// Its id.
+        id: u16,
+    },
+    /// A move began.
+    MoveStarted {
+        /// Axis.
+        axis: u8,
+        /// Target in steps.
+        target: i32,
+    },
+    /// A move ended.
+    MoveDone {
+        /// Axis.
+        axis: u8,
+        /// Position in steps.
+        position: i32,
+    },
+    /// A settling time ended.
+    Settled,
+    /// A run ended as programmed (or by `Stop`).
+    RunDone {
+        /// Number of the run.
+        run: u32,
+        /// Words put out in this run.
+        words: u32,
+        /// Events of this run, this one included.
+        events: u32,
+    },
+    /// The box stopped by itself or by `Abort`.
+    Faulted {
+        /// Cause.
+        cause: FaultCause,
+        /// Instruction being played.
+        instruction: u16,
+    },
+}
