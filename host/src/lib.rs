@@ -1,1 +1,34 @@
-//! To be written.
+//! Diffraction-assisted image correlation: 3D shape and displacement with one camera behind a
+//! transmission grating.
+//!
+//! This crate puts the parts together; each of them is useful on its own:
+//! [`daic_correlate`] (2D-DIC), [`daic_optics`] (grating, decoders, calibration), [`daic_rig`] (link,
+//! experiment, acquisition), [`daic_dataset`] (files), [`daic_report`] (figures, HTML).
+//!
+//! * [`measure`]: frames with two views become points and displacements.
+//! * [`recording`]: a run of the rig becomes a dataset.
+//! * [`process`]: a dataset becomes results, summary and report.
+//! * [`pair`]: plain 2D-DIC of two images.
+
+#[cfg(feature = "sim")]
+pub mod demo;
+pub mod doctor;
+pub mod error;
+pub mod expand;
+mod figures;
+pub mod folder_camera;
+pub mod images;
+pub mod measure;
+pub mod optics_section;
+pub mod pair;
+pub mod process;
+pub mod progress;
+pub mod recording;
+pub mod reports;
+pub mod settings;
+#[cfg(feature = "sim")]
+pub mod simulated;
+pub mod usage;
+
+pub use error::Error;
+pub use progress::{Progress, Silent};

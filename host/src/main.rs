@@ -1,2 +1,9 @@
-//! The `daic` program.
-fn main() {}
+//! The `daic` program: flags and glue, nothing else.
+
+mod cli;
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    cli::main()
+}

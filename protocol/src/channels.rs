@@ -29,11 +29,7 @@ pub const CAMERA_MASK: u32 = 0x0000_0f00;
 pub const SAFE_WORD: u32 = 0;
 
 const fn bit(first: u8, index: u8, count: u8) -> Option<u32> {
-    if index < count {
-        1u32.checked_shl(first.wrapping_add(index) as u32)
-    } else {
-        None
-    }
+    if index < count { 1u32.checked_shl(first.wrapping_add(index) as u32) } else { None }
 }
 
 /// Mask of LED `index`, or `None` beyond the last.

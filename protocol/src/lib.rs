@@ -11,8 +11,20 @@
 //!
 //! The wire is specified byte by byte in `docs/protocol.md`.
 #![no_std]
+#![forbid(unsafe_code)]
+#![cfg_attr(
+    not(test),
+    deny(
+        clippy::unwrap_used,
+        clippy::expect_used,
+        clippy::indexing_slicing,
+        clippy::arithmetic_side_effects,
+        clippy::panic
+    )
+)]
 
 pub mod channels;
+mod cobs;
 pub mod frame;
 pub mod limits;
 pub mod message;

@@ -7,7 +7,13 @@ use crate::limits::{CHUNK_LEN, EVENTS_PER_REPLY};
 use heapless::{String, Vec};
 use serde::{Deserialize, Serialize};
 
+/// Hash (CRC-32/ISO-HDLC) over the golden bytes of all messages, in the order of `tests/golden.rs`,
+/// which computes it anew. A change means that the messages have changed.
+pub const SCHEMA_HASH: u32 = 0x58e7_4cf6;
+
 /// From host to box. The frame header carries the request id.
+// Nothing here can be boxed: there is no allocator.
+#[allow(clippy::large_enum_variant)]
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Request {
     /// Who are you? Frozen for ever.
@@ -58,6 +64,7 @@ pub enum Request {
 }
 
 /// From box to host. The frame header carries the id of the request answered.
+#[allow(clippy::large_enum_variant)]
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Reply {
     /// Answer to `Hello`.

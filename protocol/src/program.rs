@@ -4,6 +4,8 @@
 //! begin → chunk → commit, validated as a whole, and played on one timeline: `Edge`, `Delay`,
 //! `Settle` and `Move` take time, everything else takes none.
 
+use crate::frame::{TooLarge, crc32};
+use crate::limits::MAX_PROGRAM_BYTES;
 use serde::{Deserialize, Serialize};
 
 /// One instruction. Append-only: the encoding of every variant is pinned by golden tests.
@@ -83,4 +85,90 @@ pub enum TriggerEdge {
     Rising,
     /// High to low.
     Falling,
+}
+
+/// Longest encoding of one instruction in bytes (`Move`: 1 + 1 + 5 + 5 + 5 + 5).
+pub const MAX_INSTRUCTION_BYTES: usize = 22;
+
+/// An encoded program.
+pub type ProgramBytes = heapless::Vec<u8, MAX_PROGRAM_BYTES>;
+
+/// The bytes do not hold an instruction (or only its beginning).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Undecodable;
+
+impl core::fmt::Display for Undecodable {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.write_str("the bytes do not hold an instruction")
+    }
+}
+
+impl core::error::Error for Undecodable {}
+
+/// Encodes one instruction.
+pub fn encode_instruction(instruction: &Instruction) -> heapless::Vec<u8, MAX_INSTRUCTION_BYTES> {
+    // The buffer holds the longest instruction; `tests/golden.rs` checks that constant.
+    let mut buffer = [0; MAX_INSTRUCTION_BYTES];
+    let used: &[u8] = postcard::to_slice(instruction, &mut buffer).map_or(&[], |used| used);
+    heapless::Vec::from_slice(used).unwrap_or_default()
+}
+
+/// Encodes a program.
+///
+/// # Errors
+/// [`TooLarge`] if it exceeds [`MAX_PROGRAM_BYTES`].
+pub fn encode<'a>(instructions: impl IntoIterator<Item = &'a Instruction>) -> Result<ProgramBytes, TooLarge> {
+    let mut bytes = ProgramBytes::new();
+    for instruction in instructions {
+        bytes.extend_from_slice(&encode_instruction(instruction)).map_err(|_| TooLarge)?;
+    }
+    Ok(bytes)
+}
+
+/// Decodes the instruction at the start of `bytes`; returns it and its length.
+///
+/// # Errors
+/// [`Undecodable`] if there is none.
+pub fn decode_instruction(bytes: &[u8]) -> Result<(Instruction, usize), Undecodable> {
+    let (instruction, rest) = postcard::take_from_bytes(bytes).map_err(|_| Undecodable)?;
+    Ok((instruction, bytes.len().saturating_sub(rest.len())))
+}
+
+/// Decodes a program; ends after the last byte or after the first error.
+pub fn decode(bytes: &[u8]) -> Decode<'_> {
+    Decode { rest: bytes, offset: 0 }
+}
+
+/// Iterator over the instructions of an encoded program with their byte offsets.
+#[derive(Debug, Clone)]
+pub struct Decode<'a> {
+    rest: &'a [u8],
+    offset: usize,
+}
+
+impl Iterator for Decode<'_> {
+    type Item = (usize, Result<Instruction, Undecodable>);
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.rest.is_empty() {
+            return None;
+        }
+        let offset = self.offset;
+        match decode_instruction(self.rest) {
+            Ok((instruction, length)) => {
+                self.rest = self.rest.get(length..).unwrap_or(&[]);
+                self.offset = offset.saturating_add(length);
+                Some((offset, Ok(instruction)))
+            }
+            Err(error) => {
+                self.rest = &[];
+                Some((offset, Err(error)))
+            }
+        }
+    }
+}
+
+/// Hash of an encoded program: its CRC-32/ISO-HDLC.
+pub fn hash(bytes: &[u8]) -> u32 {
+    crc32(bytes)
 }

@@ -1,1 +1,5 @@
-//! To be written.
+//! Tools of the whole-chain tests: the program as a user runs it, data of others, independent truths.
+
+pub mod expansion;
+pub mod program;
+pub mod shared;

@@ -1,0 +1,94 @@
+//! Staged loading: a program is complete and valid before it replaces the old one.
+
+use crate::board::Board;
+use crate::verifier;
+use daic_protocol::limits::{CHUNK_LEN, MAX_PROGRAM_BYTES};
+use daic_protocol::message::Refusal;
+use daic_protocol::program::{self, ProgramBytes};
+
+/// One bit per chunk received.
+type ChunkSet = u128;
+const _: () = assert!(MAX_PROGRAM_BYTES.div_ceil(CHUNK_LEN) <= ChunkSet::BITS as usize);
+
+/// The committed program and the one being received.
+#[derive(Debug)]
+pub(crate) struct Loader {
+    live: ProgramBytes,
+    hash: Option<u32>,
+    staged: ProgramBytes,
+    staging: Option<ChunkSet>,
+}
+
+impl Loader {
+    pub(crate) const fn new() -> Self {
+        Self { live: ProgramBytes::new(), hash: None, staged: ProgramBytes::new(), staging: None }
+    }
+
+    /// Hash of the committed program.
+    pub(crate) fn hash(&self) -> Option<u32> {
+        self.hash
+    }
+
+    /// The committed program.
+    pub(crate) fn program(&self) -> &[u8] {
+        &self.live
+    }
+
+    pub(crate) fn begin(&mut self, length: u32) -> Result<(), Refusal> {
+        let too_long = Refusal::ProgramTooLong { length, max: MAX_PROGRAM_BYTES as u32 };
+        let bytes = usize::try_from(length).map_err(|_| too_long)?;
+        if bytes > MAX_PROGRAM_BYTES {
+            return Err(too_long);
+        }
+        self.staged.clear();
+        self.staged.resize(bytes, 0).map_err(|_| too_long)?;
+        self.staging = Some(0);
+        Ok(())
+    }
+
+    pub(crate) fn chunk(&mut self, index: u16, data: &[u8]) -> Result<(), Refusal> {
+        let received = self.staging.as_mut().ok_or(Refusal::NotStaging)?;
+        let length = u16::try_from(data.len()).unwrap_or(u16::MAX);
+        let place = self.staged.chunks_mut(CHUNK_LEN).nth(usize::from(index));
+        let expected = place.as_ref().map_or(0, |p| p.len());
+        let place = place.filter(|p| p.len() == data.len()).ok_or(Refusal::BadChunk {
+            index,
+            length,
+            expected: u16::try_from(expected).unwrap_or(u16::MAX),
+        })?;
+        // A chunk that exists has an index below the number of bits.
+        let bit: ChunkSet = 1u128.checked_shl(u32::from(index)).unwrap_or(0);
+        if *received & bit != 0 {
+            return if place == data { Ok(()) } else { Err(Refusal::ChunkChanged { index }) };
+        }
+        place.copy_from_slice(data);
+        *received |= bit;
+        Ok(())
+    }
+
+    pub(crate) fn commit(&mut self, length: u32, hash: u32, board: &Board) -> Result<(), Refusal> {
+        let received = self.staging.ok_or(Refusal::NotStaging)?;
+        let begun = u32::try_from(self.staged.len()).unwrap_or(u32::MAX);
+        if begun != length {
+            return Err(Refusal::LengthDiffers { begun, committed: length });
+        }
+        let missing = u16::try_from(received.trailing_ones()).unwrap_or(u16::MAX);
+        if usize::from(missing) < self.staged.len().div_ceil(CHUNK_LEN) {
+            return Err(Refusal::ChunkMissing { index: missing });
+        }
+        let computed = program::hash(&self.staged);
+        if computed != hash {
+            return Err(Refusal::HashDiffers { computed, given: hash });
+        }
+        verifier::verify(&self.staged, board).map_err(Refusal::Invalid)?;
+        core::mem::swap(&mut self.live, &mut self.staged);
+        self.hash = Some(hash);
+        self.abort();
+        Ok(())
+    }
+
+    pub(crate) fn abort(&mut self) {
+        self.staged.clear();
+        self.staging = None;
+    }
+}

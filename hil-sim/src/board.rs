@@ -1,0 +1,360 @@
+//! The real controller on a virtual clock.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::Sender;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use daic_firmware::{AxisLimits, Board, Controller, LedLimits, Sink};
+use daic_protocol::channels::{AXES, LEDS, SAFE_WORD};
+use daic_protocol::limits::TICK_HZ;
+use daic_protocol::message::Capabilities;
+
+use crate::config::{BoardConfig, ClockMode, FaultsConfig, SimConfig};
+use crate::hash::mix;
+use crate::record::Record;
+use crate::transport::Link;
+use crate::world::{ExposureRecord, World};
+
+/// In stepped mode a program is played for so many virtual seconds before the link is polled in between.
+pub const STEPPED_PATIENCE_S: f64 = 60.0;
+
+/// Longest sleep of the loop, which bounds the delay of a stop.
+const NAP: Duration = Duration::from_millis(10);
+/// Outputs or events played between two looks at the link once patience has run out.
+const SLICE: usize = 4096;
+
+/// State of the simulated rig that no part of it could know by itself.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct Truth {
+    /// Ticks since the rig started; unlike the box's own count it goes on when the box is reset.
+    pub tick: u64,
+    /// Steps made by each axis since the rig started.
+    pub stage_steps: [i64; AXES as usize],
+    /// Where the stage stands: x right, y down, h towards the camera.
+    pub stage_mm: [f64; 3],
+    /// Exposures begun.
+    pub exposures: u64,
+    /// Triggers that came while the camera was busy, and had no effect.
+    pub missed_triggers: u64,
+    /// Times the box has booted.
+    pub boots: u32,
+}
+
+/// What board thread and rig share.
+#[derive(Debug)]
+pub(crate) struct Shared {
+    pub(crate) stop: AtomicBool,
+    pub(crate) reset: AtomicBool,
+    pub(crate) silent: AtomicBool,
+    pub(crate) render: AtomicBool,
+    /// New exposure in nanoseconds, 0 for none.
+    pub(crate) exposure_ns: AtomicU64,
+    /// Exposures ended and not yet turned into frames.
+    pub(crate) pending: AtomicU64,
+    pub(crate) record: Mutex<Record>,
+    pub(crate) truth: Mutex<Truth>,
+}
+
+impl Shared {
+    pub(crate) fn new() -> Self {
+        Self {
+            stop: AtomicBool::new(false),
+            reset: AtomicBool::new(false),
+            silent: AtomicBool::new(false),
+            render: AtomicBool::new(true),
+            exposure_ns: AtomicU64::new(0),
+            pending: AtomicU64::new(0),
+            record: Mutex::default(),
+            truth: Mutex::new(Truth {
+                tick: 0,
+                stage_steps: [0; AXES as usize],
+                stage_mm: [0.0; 3],
+                exposures: 0,
+                missed_triggers: 0,
+                boots: 1,
+            }),
+        }
+    }
+
+    pub(crate) fn rendering(&self) -> bool {
+        self.render.load(Ordering::Relaxed)
+    }
+
+    pub(crate) fn stopping(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+}
+
+/// The data behind the lock are whole after any panic.
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Passes what the controller puts out to the world and the record.
+struct Wires<'a> {
+    world: &'a mut World,
+    record: MutexGuard<'a, Record>,
+    boot_tick: u64,
+}
+
+impl Sink for Wires<'_> {
+    fn word(&mut self, tick: u64, word: u32) {
+        let tick = self.boot_tick.saturating_add(tick);
+        self.world.word(tick, word);
+        self.record.word(tick, word);
+    }
+    fn level(&mut self, tick: u64, led: u8, level: u16) {
+        let tick = self.boot_tick.saturating_add(tick);
+        self.world.level(tick, led, level);
+        self.record.levels.push((tick, led, level));
+    }
+}
+
+pub(crate) struct BoardThread {
+    config: SimConfig,
+    controller: Controller,
+    world: World,
+    link: Box<dyn Link>,
+    exposures: Sender<ExposureRecord>,
+    shared: Arc<Shared>,
+    /// Simulated time in ticks since the rig started.
+    now: u64,
+    /// When the box last booted; its own ticks count from there.
+    boot_tick: u64,
+    boots: u32,
+    answered: u32,
+}
+
+impl BoardThread {
+    pub(crate) fn new(
+        config: &SimConfig,
+        link: Box<dyn Link>,
+        exposures: Sender<ExposureRecord>,
+        shared: Arc<Shared>,
+    ) -> Self {
+        Self {
+            controller: boot(config, 1),
+            world: World::new(config),
+            config: config.clone(),
+            link,
+            exposures,
+            shared,
+            now: 0,
+            boot_tick: 0,
+            boots: 1,
+            answered: 0,
+        }
+    }
+
+    /// Runs until the rig stops.
+    pub(crate) fn run(mut self) {
+        match self.config.clock {
+            ClockMode::Stepped { baud } => {
+                let byte_ticks = (10 * u64::from(TICK_HZ)).div_ceil(u64::from(baud));
+                self.run_stepped(byte_ticks);
+            }
+            ClockMode::Wall { rate } => self.run_wall(rate),
+        }
+        self.link.drain();
+    }
+
+    fn run_stepped(&mut self, byte_ticks: u64) {
+        let mut buffer = [0; 1024];
+        while !self.shared.stopping() {
+            self.take_commands();
+            let nap = if self.due().is_some() {
+                self.play_on(SLICE, 0);
+                Duration::ZERO
+            } else {
+                NAP
+            };
+            let count = self.link.read(&mut buffer, nap);
+            self.before_bytes();
+            for &byte in &buffer[..count] {
+                // Byte by byte, so that nothing depends on how the stream was cut.
+                self.now += byte_ticks;
+                self.play_until(self.now);
+                let idle = self.due().is_none();
+                let answer = self.receive(&[byte]);
+                self.now += byte_ticks * answer.len() as u64;
+                if !answer.is_empty() {
+                    // Whoever reads the answer may rely on the state published.
+                    self.publish();
+                    self.link.write(&answer);
+                }
+                if idle && self.due().is_some() {
+                    self.play_on(0, (STEPPED_PATIENCE_S * f64::from(TICK_HZ)) as u64);
+                }
+                if self.shared.stopping() {
+                    return;
+                }
+            }
+            self.publish();
+        }
+    }
+
+    /// Plays what is due: `outputs` of them, and whatever comes within `ticks` from now.
+    fn play_on(&mut self, outputs: usize, ticks: u64) {
+        let end = self.now.saturating_add(ticks);
+        let mut played = 0usize;
+        while let Some(due) = self.due() {
+            if due > end && played >= outputs {
+                return;
+            }
+            self.play_until(due);
+            self.now = self.now.max(due);
+            played += 1;
+            if played.is_multiple_of(SLICE) {
+                self.publish();
+                if self.shared.stopping() {
+                    return;
+                }
+            }
+        }
+        // Playing includes letting the camera finish: else the last frame would wait for the host
+        // to say something.
+        if let Some(free) = self.world.camera_free_at() {
+            self.now = self.now.max(free);
+            self.world.advance(self.now);
+        }
+    }
+
+    fn run_wall(&mut self, rate: f64) {
+        let start = Instant::now();
+        let ticks_per_s = f64::from(TICK_HZ) * rate;
+        let mut buffer = [0; 1024];
+        while !self.shared.stopping() {
+            self.take_commands();
+            self.now = self.now.max((start.elapsed().as_secs_f64() * ticks_per_s) as u64);
+            self.play_until(self.now);
+            self.world.advance(self.now);
+            self.publish();
+            let next = self.due().into_iter().chain(self.world.camera_free_at()).min();
+            let nap = next.map_or(NAP, |due| {
+                Duration::from_secs_f64((due.saturating_sub(self.now) as f64 / ticks_per_s).min(NAP.as_secs_f64()))
+            });
+            let count = self.link.read(&mut buffer, nap);
+            if count > 0 {
+                self.before_bytes();
+                self.now = self.now.max((start.elapsed().as_secs_f64() * ticks_per_s) as u64);
+                self.play_until(self.now);
+                let answer = self.receive(&buffer[..count]);
+                self.publish();
+                self.link.write(&answer);
+            }
+        }
+    }
+
+    /// Tick of the controller's next output or event, in simulated time.
+    fn due(&self) -> Option<u64> {
+        self.controller.next_due().map(|tick| self.boot_tick.saturating_add(tick))
+    }
+
+    fn play_until(&mut self, tick: u64) {
+        let mut wires = Wires { world: &mut self.world, record: lock(&self.shared.record), boot_tick: self.boot_tick };
+        self.controller.play(tick.saturating_sub(self.boot_tick), &mut wires);
+    }
+
+    /// Gives bytes to the controller and returns what it answers.
+    fn receive(&mut self, bytes: &[u8]) -> Vec<u8> {
+        let FaultsConfig { reset_after_requests, silent_after_requests, .. } = self.config.faults;
+        let mut answer = Vec::new();
+        let mut reset = false;
+        let mut silent = self.shared.silent.load(Ordering::Relaxed);
+        let mut answered = self.answered;
+        {
+            let mut wires =
+                Wires { world: &mut self.world, record: lock(&self.shared.record), boot_tick: self.boot_tick };
+            self.controller.receive(self.now - self.boot_tick, bytes, &mut wires, &mut |reply| {
+                reset |= reset_after_requests == Some(answered) && self.boots == 1;
+                silent |= silent_after_requests.is_some_and(|limit| answered >= limit);
+                answered = answered.saturating_add(1);
+                if !silent && !reset {
+                    answer.extend_from_slice(reply);
+                }
+            });
+        }
+        self.answered = answered;
+        if reset {
+            self.reboot();
+        }
+        answer
+    }
+
+    /// What was set before these bytes were sent must hold for them, and a new host must not find
+    /// its first frame glued to half a frame of the one before.
+    fn before_bytes(&mut self) {
+        self.take_commands();
+        if self.link.restarted() {
+            self.controller.link_restarted();
+        }
+    }
+
+    fn take_commands(&mut self) {
+        let exposure = self.shared.exposure_ns.swap(0, Ordering::Relaxed);
+        if exposure > 0 {
+            self.world.camera_mut().set_exposure_ns(exposure);
+        }
+        if self.shared.reset.swap(false, Ordering::Relaxed) {
+            self.reboot();
+        }
+    }
+
+    /// The box starts anew with all outputs off; stage and camera stay as they are.
+    fn reboot(&mut self) {
+        self.boots += 1;
+        self.boot_tick = self.now;
+        self.controller = boot(&self.config, self.boots);
+        self.world.word(self.now, SAFE_WORD);
+        for led in 0..LEDS {
+            self.world.level(self.now, led, 0);
+        }
+        lock(&self.shared.record).word(self.now, SAFE_WORD);
+    }
+
+    fn publish(&mut self) {
+        for exposure in self.world.take_exposures() {
+            self.shared.pending.fetch_add(1, Ordering::SeqCst);
+            if self.exposures.send(exposure).is_err() {
+                self.shared.pending.fetch_sub(1, Ordering::SeqCst);
+            }
+        }
+        let truth = Truth {
+            tick: self.now,
+            stage_steps: self.world.stage().steps(),
+            stage_mm: self.world.stage().position_mm(),
+            exposures: self.world.camera().exposures(),
+            missed_triggers: self.world.camera().missed_triggers(),
+            boots: self.boots,
+        };
+        *lock(&self.shared.truth) = truth;
+    }
+}
+
+fn boot(config: &SimConfig, boots: u32) -> Controller {
+    // A new id at every boot, the same ones for the same seed.
+    let boot_id = mix(mix(config.seed) ^ u64::from(boots)) as u32;
+    Controller::new(board(&config.board), boot_id)
+}
+
+fn board(config: &BoardConfig) -> Board {
+    // The numbers of axes and LEDs have been checked against the protocol's by validation.
+    Board {
+        name: "hil-sim",
+        capabilities: Capabilities::SIMULATED,
+        axes: config
+            .axes
+            .iter()
+            .take(usize::from(AXES))
+            .map(|a| AxisLimits { min: a.min, max: a.max, max_rate: a.max_rate, max_acceleration: a.max_acceleration })
+            .collect(),
+        leds: config
+            .leds
+            .iter()
+            .take(usize::from(LEDS))
+            .map(|l| LedLimits { max_pulse: l.max_pulse, settle: l.settle })
+            .collect(),
+        cameras: config.cameras,
+    }
+}

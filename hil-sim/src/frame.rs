@@ -1,0 +1,145 @@
+//! From an exposure to a frame.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use crate::config::SimConfig;
+use crate::error::ConfigError;
+use crate::scene::Scene;
+use crate::sensor::Sensor;
+use crate::world::{ExposureRecord, ns_from_ticks};
+
+/// A frame as the camera delivers it, and apart from that the truth about it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SimFrame {
+    /// The camera's frame number; counts lost frames too.
+    pub id: u64,
+    /// Start of the exposure by the camera's own clock, which has its own offset and rate.
+    pub camera_ns: u64,
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Significant bits of a pixel value.
+    pub bits: u8,
+    /// Pixel values row by row.
+    pub data: Vec<u16>,
+    /// What no camera knows.
+    pub truth: FrameTruth,
+}
+
+/// What really happened during an exposure.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct FrameTruth {
+    /// Tick of the trigger edge.
+    pub trigger_tick: u64,
+    /// First tick of the exposure.
+    pub exposure_start_tick: u64,
+    /// Tick at which the exposure ended.
+    pub exposure_end_tick: u64,
+    /// Photo-electrons that a pixel of reflectance 1 expects; 0 for a dark frame.
+    pub electrons: f64,
+    /// Mean position of the stage, weighted by the light; `None` for a dark frame.
+    pub stage_mm: Option<[f64; 3]>,
+    /// Number of positions averaged; more than 1 if the specimen moved while lit.
+    pub positions: usize,
+    /// Distance in millimetres within which positions were taken as one.
+    pub blur_step_mm: f64,
+}
+
+/// Rendered positions kept: series often come back to the same place.
+const KEPT: usize = 3;
+
+/// Makes frames from exposures.
+#[derive(Debug)]
+pub struct Imager {
+    scene: Scene,
+    sensor: Sensor,
+    config: SimConfig,
+    rendered: VecDeque<([f64; 3], Arc<Vec<f32>>)>,
+}
+
+impl Imager {
+    /// Prepares scene and sensor of a configuration.
+    pub fn new(config: &SimConfig) -> Result<Self, ConfigError> {
+        Ok(Self {
+            scene: Scene::new(config)?,
+            sensor: Sensor::new(&config.camera, config.seed),
+            config: config.clone(),
+            rendered: VecDeque::new(),
+        })
+    }
+
+    /// The scene.
+    pub fn scene(&self) -> &Scene {
+        &self.scene
+    }
+
+    /// Expected photo-electrons per pixel, row by row.
+    pub fn expose(&mut self, exposure: &ExposureRecord) -> Vec<f32> {
+        let (width, height) = self.scene.size();
+        let mut expected = vec![0.0f32; width * height];
+        for position in exposure.light.positions() {
+            let image = self.render(position.stage_mm);
+            let electrons = position.electrons as f32;
+            expected.par_chunks_mut(width).zip(image.par_chunks(width)).for_each(|(sum, row)| {
+                for (sum, reflectance) in sum.iter_mut().zip(row) {
+                    *sum += electrons * reflectance;
+                }
+            });
+        }
+        expected
+    }
+
+    /// The frame of an exposure, noise included.
+    pub fn frame(&mut self, exposure: &ExposureRecord) -> SimFrame {
+        let expected = self.expose(exposure);
+        let (width, height) = self.scene.size();
+        let positions = exposure.light.positions();
+        let electrons: f64 = positions.iter().map(|p| p.electrons).sum();
+        let mean = [0, 1, 2].map(|k| positions.iter().map(|p| p.stage_mm[k] * p.electrons).sum::<f64>() / electrons);
+        let stage_mm = match &positions[..] {
+            [] => None,
+            [one] => Some(one.stage_mm),
+            _ => Some(mean),
+        };
+        SimFrame {
+            id: exposure.id,
+            camera_ns: self.camera_ns(exposure.start_tick),
+            width,
+            height,
+            bits: self.config.camera.bits,
+            data: self.sensor.read(exposure.id, &expected),
+            truth: FrameTruth {
+                trigger_tick: exposure.trigger_tick,
+                exposure_start_tick: exposure.start_tick,
+                exposure_end_tick: exposure.end_tick,
+                electrons,
+                stage_mm,
+                positions: positions.len(),
+                blur_step_mm: exposure.light.step_mm(),
+            },
+        }
+    }
+
+    /// Time of a tick by the camera's clock.
+    fn camera_ns(&self, tick: u64) -> u64 {
+        let ns = ns_from_ticks(tick);
+        let gained = (ns as f64 * self.config.camera.clock_drift_ppm * 1e-6).round() as i64;
+        self.config.camera.clock_offset_ns.saturating_add(ns).saturating_add_signed(gained)
+    }
+
+    fn render(&mut self, stage_mm: [f64; 3]) -> Arc<Vec<f32>> {
+        if let Some((_, image)) = self.rendered.iter().find(|(at, _)| *at == stage_mm) {
+            return Arc::clone(image);
+        }
+        let image = Arc::new(self.scene.render(stage_mm));
+        if self.rendered.len() == KEPT {
+            self.rendered.pop_front();
+        }
+        self.rendered.push_back((stage_mm, Arc::clone(&image)));
+        image
+    }
+}

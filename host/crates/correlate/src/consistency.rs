@@ -1,0 +1,120 @@
+//! What neighbours say about a point, and whether a group of points can be chance.
+
+use crate::icgn::{Outcome, Solver, significant};
+use crate::point::Status;
+use crate::points::Points;
+
+/// Groups that confirm each other but cover less than this many subsets may be one chance match:
+/// overlapping subsets share their pixels.
+const GROUP_SUBSETS: f64 = 4.0;
+/// How much more significant than usual the best point of such a group must be.
+const GROUP_FACTOR: f64 = 1.5;
+
+/// Judges accepted points by their neighbours: those which are contradicted become
+/// [`Status::Inconsistent`], small groups that may be chance [`Status::LowCorrelation`].
+pub(crate) fn judge(solver: &Solver<'_>, points: &Points, outcomes: &mut [Option<Outcome>]) {
+    let tolerance = solver.settings.consistency;
+    let contradicted: Vec<usize> = (0..outcomes.len())
+        .filter(|&k| {
+            if !accepted(&outcomes[k]) {
+                return false;
+            }
+            let (mut asked, mut agree) = (0, 0);
+            for &c in points.neighbours(k) {
+                let c = c as usize;
+                if accepted(&outcomes[c]) {
+                    asked += 1;
+                    agree += usize::from(agrees(points, outcomes, k, c, tolerance));
+                }
+            }
+            // a lone point cannot be confirmed; a discontinuity leaves half of the neighbours
+            4 * agree < asked
+        })
+        .collect();
+    mark(outcomes, &contradicted, Status::Inconsistent);
+    if solver.settings.significance > 0.0 {
+        let chance = chance_groups(solver, points, outcomes, tolerance);
+        mark(outcomes, &chance, Status::LowCorrelation);
+    }
+}
+
+fn accepted(outcome: &Option<Outcome>) -> bool {
+    outcome.is_some_and(|o| o.status == Status::Converged)
+}
+
+fn mark(outcomes: &mut [Option<Outcome>], which: &[usize], status: Status) {
+    for &k in which {
+        if let Some(o) = &mut outcomes[k] {
+            o.status = status;
+        }
+    }
+}
+
+/// Points of groups which confirm each other, are small, and hold no point of high significance.
+fn chance_groups(
+    solver: &Solver<'_>,
+    points: &Points,
+    outcomes: &[Option<Outcome>],
+    tolerance: f64,
+) -> Vec<usize> {
+    let width = solver.settings.subset as f64;
+    let mut seen = vec![false; outcomes.len()];
+    let mut chance = Vec::new();
+    let mut group: Vec<usize> = Vec::new();
+    for start in 0..outcomes.len() {
+        if seen[start] || !accepted(&outcomes[start]) {
+            continue;
+        }
+        seen[start] = true;
+        group.clear();
+        group.push(start);
+        let (mut lo, mut hi) = (points.positions()[start], points.positions()[start]);
+        let mut next = 0;
+        let mut best = f64::NEG_INFINITY;
+        while let Some(&k) = group.get(next) {
+            next += 1;
+            let p = points.positions()[k];
+            for c in 0..2 {
+                lo[c] = lo[c].min(p[c]);
+                hi[c] = hi[c].max(p[c]);
+            }
+            if let Some(o) = &outcomes[k] {
+                // above what chance alone would need
+                let bar = significant(GROUP_FACTOR * solver.settings.significance, o.independent);
+                best = best.max(o.zncc - bar);
+            }
+            for &c in points.neighbours(k) {
+                let c = c as usize;
+                if !seen[c] && accepted(&outcomes[c]) && agrees(points, outcomes, k, c, tolerance) {
+                    seen[c] = true;
+                    group.push(c);
+                }
+            }
+        }
+        let covered = (hi[0] - lo[0] + width) * (hi[1] - lo[1] + width) / (width * width);
+        if covered < GROUP_SUBSETS && best < 0.0 {
+            chance.extend_from_slice(&group);
+        }
+    }
+    chance
+}
+
+/// Whether two points, each extrapolated to the middle between them, agree.
+fn agrees(
+    points: &Points,
+    outcomes: &[Option<Outcome>],
+    a: usize,
+    b: usize,
+    tolerance: f64,
+) -> bool {
+    let (Some(oa), Some(ob)) = (&outcomes[a], &outcomes[b]) else {
+        return false;
+    };
+    let ((xa, ya), _) = points.centre(a);
+    let ((xb, yb), _) = points.centre(b);
+    let (dx, dy) = (0.5 * f64::from(xb - xa), 0.5 * f64::from(yb - ya));
+    let p = oa.warp.at(dx, dy);
+    let q = ob.warp.at(-dx, -dy);
+    let (u, v) = (p[0] - q[0], p[1] - q[1]);
+    u * u + v * v <= tolerance * tolerance
+}

@@ -1,0 +1,360 @@
+//! The run over all points: checks, initial guesses, propagation, verdicts.
+
+use crate::consistency;
+use crate::icgn::{Outcome, Solver};
+use crate::point::{Point, ShapeParameters, Status};
+use crate::points::Points;
+use crate::prepared::{Reference, Target};
+use crate::propagate::Propagation;
+use crate::settings::{Interpolation, Settings, SettingsError};
+use fearless_simd::Level;
+use std::time::{Duration, Instant};
+use thiserror::Error;
+
+/// Where the first displacements come from.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum Guess<'a> {
+    /// Whole-image and local cross-correlation by FFT; shifts up to half the image.
+    #[default]
+    Fft,
+    /// Whole-pixel search over a range of displacements, e.g. along the diffraction direction when
+    /// one view is matched to the other in the same frame.
+    Search {
+        /// Smallest and largest u, pixels.
+        u: (f64, f64),
+        /// Smallest and largest v, pixels.
+        v: (f64, f64),
+    },
+    /// A displacement (u, v) for every point, good to about two pixels. Points with `None`, and
+    /// those that fail from their guess, are reached from their neighbours.
+    Given(&'a [Option<[f64; 2]>]),
+}
+
+/// Stage of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Stage {
+    /// Initial guesses and seeds.
+    Init,
+    /// Optimisation of all points.
+    Solve,
+}
+
+/// Told how far a run has come; may stop it.
+pub trait Observer: Sync {
+    /// A stage has begun. Called from the thread that called [`correlate`].
+    fn stage(&self, stage: Stage) {
+        let _ = stage;
+    }
+
+    /// `done` of `total` points have been treated.
+    fn points(&self, done: usize, total: usize) {
+        let _ = (done, total);
+    }
+
+    /// Whether the run should stop; asked often, from any thread.
+    fn cancelled(&self) -> bool {
+        false
+    }
+}
+
+/// Says nothing, stops nothing.
+impl Observer for () {}
+
+/// Why a run did not take place or did not end.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum CorrelateError {
+    /// A setting is unusable.
+    #[error(transparent)]
+    Settings(#[from] SettingsError),
+    /// The images differ in size.
+    #[error(
+        "the reference image has {reference_width}×{reference_height} pixels, the deformed image {target_width}×{target_height}"
+    )]
+    ImageSize {
+        /// Columns of the reference image.
+        reference_width: usize,
+        /// Rows of the reference image.
+        reference_height: usize,
+        /// Columns of the deformed image.
+        target_width: usize,
+        /// Rows of the deformed image.
+        target_height: usize,
+    },
+    /// The deformed image was prepared for another interpolation.
+    #[error(
+        "the deformed image was prepared for {prepared:?} interpolation, the settings ask for {wanted:?}"
+    )]
+    Interpolation {
+        /// Interpolation of the prepared image.
+        prepared: Interpolation,
+        /// Interpolation in the settings.
+        wanted: Interpolation,
+    },
+    /// The list of guesses does not belong to the points.
+    #[error("{guesses} initial guesses were given for {points} points")]
+    GuessCount {
+        /// Guesses given.
+        guesses: usize,
+        /// Points.
+        points: usize,
+    },
+    /// A guess or a search range is not a number, or too large.
+    #[error("the initial guess {index} is not a finite displacement within ±{limit} pixels")]
+    GuessValue {
+        /// Index in the list; 0 for a search range.
+        index: usize,
+        /// Largest displacement accepted.
+        limit: f64,
+    },
+    /// The search range is empty or too large to be searched.
+    #[error("the search range u {u:?}, v {v:?} must be ascending and at most {limit} shifts")]
+    SearchRange {
+        /// Range of u.
+        u: (f64, f64),
+        /// Range of v.
+        v: (f64, f64),
+        /// Most shifts accepted.
+        limit: f64,
+    },
+    /// The observer asked to stop.
+    #[error("the correlation was cancelled after {done} of {total} points")]
+    Cancelled {
+        /// Points treated.
+        done: usize,
+        /// Points in all.
+        total: usize,
+    },
+}
+
+/// Wall time of the stages of a run. Preparation of the images is timed by whoever prepares them.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Timing {
+    /// Initial guesses.
+    pub init: Duration,
+    /// Optimisation and verdicts.
+    pub solve: Duration,
+}
+
+/// Result of a run: one entry per point, in the points' order.
+#[derive(Debug, Clone)]
+pub struct Correlation {
+    /// Results.
+    pub points: Vec<Point>,
+    /// Wall times.
+    pub timing: Timing,
+}
+
+impl Correlation {
+    /// Number of points with [`Status::Converged`].
+    pub fn converged(&self) -> usize {
+        self.points.iter().filter(|p| p.status.is_ok()).count()
+    }
+}
+
+/// Largest displacement that may be asked for.
+const LIMIT: f64 = 65536.0;
+/// Most shifts searched at one seed.
+const MAX_SHIFTS: f64 = 16e6;
+
+/// Correlates the deformed image `target` with `reference` at `points`.
+///
+/// Runs on the current rayon thread pool; the result does not depend on its size.
+///
+/// # Errors
+/// [`CorrelateError`]; failures at single points are reported by their [`Status`].
+pub fn correlate(
+    reference: &Reference,
+    target: &Target,
+    points: &Points,
+    guess: &Guess<'_>,
+    settings: &Settings,
+    observer: &dyn Observer,
+) -> Result<Correlation, CorrelateError> {
+    correlate_at(
+        Level::new(),
+        false,
+        reference,
+        target,
+        points,
+        guess,
+        settings,
+        observer,
+    )
+}
+
+/// As [`correlate`], with the scalar double-precision reference implementation of the inner loops:
+/// some hundred times slower, for checking.
+///
+/// # Errors
+/// As [`correlate`].
+pub fn correlate_scalar(
+    reference: &Reference,
+    target: &Target,
+    points: &Points,
+    guess: &Guess<'_>,
+    settings: &Settings,
+    observer: &dyn Observer,
+) -> Result<Correlation, CorrelateError> {
+    correlate_at(
+        Level::new(),
+        true,
+        reference,
+        target,
+        points,
+        guess,
+        settings,
+        observer,
+    )
+}
+
+/// Name of the SIMD instruction set that the kernels use on this machine.
+pub fn simd_level() -> String {
+    let debug = format!("{:?}", Level::new());
+    debug
+        .split(['(', ' ', '{'])
+        .next()
+        .unwrap_or_default()
+        .to_owned()
+}
+
+fn check(
+    reference: &Reference,
+    target: &Target,
+    points: &Points,
+    guess: &Guess<'_>,
+    settings: &Settings,
+) -> Result<(), CorrelateError> {
+    let (a, b) = (&reference.image, &target.image);
+    if (a.width(), a.height()) != (b.width(), b.height()) {
+        return Err(CorrelateError::ImageSize {
+            reference_width: a.width(),
+            reference_height: a.height(),
+            target_width: b.width(),
+            target_height: b.height(),
+        });
+    }
+    settings.validate_for(a.width(), a.height())?;
+    if target.interpolation != settings.interpolation {
+        return Err(CorrelateError::Interpolation {
+            prepared: target.interpolation,
+            wanted: settings.interpolation,
+        });
+    }
+    let usable = |c: f64| c.is_finite() && c.abs() <= LIMIT;
+    match guess {
+        Guess::Fft => {}
+        Guess::Search { u, v } => {
+            if ![u.0, u.1, v.0, v.1].into_iter().all(usable) {
+                return Err(CorrelateError::GuessValue {
+                    index: 0,
+                    limit: LIMIT,
+                });
+            }
+            let shifts = (u.1 - u.0 + 1.0) * (v.1 - v.0 + 1.0);
+            if u.1 < u.0 || v.1 < v.0 || shifts > MAX_SHIFTS {
+                return Err(CorrelateError::SearchRange {
+                    u: *u,
+                    v: *v,
+                    limit: MAX_SHIFTS,
+                });
+            }
+        }
+        Guess::Given(list) => {
+            if list.len() != points.len() {
+                return Err(CorrelateError::GuessCount {
+                    guesses: list.len(),
+                    points: points.len(),
+                });
+            }
+            if let Some(index) = list
+                .iter()
+                .position(|g| g.is_some_and(|d| !d.into_iter().all(usable)))
+            {
+                return Err(CorrelateError::GuessValue {
+                    index,
+                    limit: LIMIT,
+                });
+            }
+        }
+    }
+    Ok(())
+}
+
+#[allow(clippy::too_many_arguments)]
+fn correlate_at(
+    level: Level,
+    scalar: bool,
+    reference: &Reference,
+    target: &Target,
+    points: &Points,
+    guess: &Guess<'_>,
+    settings: &Settings,
+    observer: &dyn Observer,
+) -> Result<Correlation, CorrelateError> {
+    check(reference, target, points, guess, settings)?;
+    let start = Instant::now();
+    observer.stage(Stage::Init);
+    let mut solver = Solver::new(reference, target, settings, level);
+    solver.scalar = scalar;
+    let mut run = Propagation::new(&solver, points, observer);
+    let seeds = run.start(guess);
+    let init = start.elapsed();
+    observer.stage(Stage::Solve);
+    run.finish(seeds, guess);
+    if observer.cancelled() {
+        return Err(CorrelateError::Cancelled {
+            done: run.done(),
+            total: points.len(),
+        });
+    }
+    let mut outcomes = run.outcomes;
+    consistency::judge(&solver, points, &mut outcomes);
+    let points = outcomes
+        .iter()
+        .enumerate()
+        .map(|(k, o)| point(points, k, o.as_ref()))
+        .collect();
+    Ok(Correlation {
+        points,
+        timing: Timing {
+            init,
+            solve: start.elapsed() - init,
+        },
+    })
+}
+
+fn point(points: &Points, k: usize, outcome: Option<&Outcome>) -> Point {
+    let [x, y] = points.positions()[k];
+    let mut p = Point {
+        x,
+        y,
+        u: f64::NAN,
+        v: f64::NAN,
+        sigma_u: f32::NAN,
+        sigma_v: f32::NAN,
+        zncc: f32::NAN,
+        iterations: 0,
+        status: Status::NoGuess,
+        shape: ShapeParameters::default(),
+    };
+    let Some(o) = outcome else {
+        return p;
+    };
+    p.status = o.status;
+    p.iterations = o.iterations;
+    if o.iterations == 0 {
+        return p;
+    }
+    p.zncc = o.zncc as f32;
+    let (_, offset) = points.centre(k);
+    [p.u, p.v] = o.warp.at(offset[0], offset[1]);
+    [p.sigma_u, p.sigma_v] = o.sigma;
+    let derivatives = |c: &[f64; 6]| {
+        [c[0], c[1], c[2], 2.0 * c[3], c[4], 2.0 * c[5]].map(|d| d as f32)
+    };
+    p.shape = ShapeParameters {
+        u: derivatives(&o.warp.0[0]),
+        v: derivatives(&o.warp.0[1]),
+    };
+    p
+}

@@ -1,0 +1,376 @@
+//! Inverse-compositional Gauss–Newton for one point (Pan, Li & Tong, Exp. Mech. 53 (2013) 1277;
+//! second order: Gao et al., Opt. Lasers Eng. 65 (2015) 73), criterion ZNSSD.
+
+use crate::kernel::{Sampling, Sums, sweep};
+use crate::noise::NoiseGain;
+use crate::normal::{MAX, Normal};
+use crate::plane::PAD;
+use crate::point::Status;
+use crate::prepared::{Reference, Target};
+use crate::scalar;
+use crate::settings::{Interpolation, Settings};
+use crate::shape::{Shape, Warp};
+use crate::subset::{Layout, Subset};
+use fearless_simd::{Level, dispatch, prelude::*};
+use fearless_simd_macros::simd;
+
+/// How far, in pixels, the iteration may overhang the deformed image before it is given up; the
+/// padding holds mirrored grey levels there.
+const OVERHANG: f64 = (PAD - 12) as f64;
+/// How far a converged subset may overhang: half a pixel, so that noise does not decide on
+/// subsets which touch the border.
+const BORDER: f64 = 0.5;
+
+/// All that is common to the points of one run.
+pub(crate) struct Solver<'a> {
+    pub(crate) reference: &'a Reference,
+    pub(crate) target: &'a Target,
+    pub(crate) settings: &'a Settings,
+    pub(crate) layout: Layout,
+    pub(crate) noise: NoiseGain,
+    pub(crate) level: Level,
+    /// Uses the scalar reference implementation instead of the vector kernels.
+    pub(crate) scalar: bool,
+}
+
+/// Memory of one thread, used again for every point.
+#[derive(Default)]
+pub(crate) struct Scratch {
+    pub(crate) subset: Subset,
+    normal: Option<Normal>,
+    warped: Vec<f32>,
+}
+
+/// What the iteration left.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Outcome {
+    pub(crate) warp: Warp,
+    pub(crate) zncc: f64,
+    /// Independent speckles in the reference subset.
+    pub(crate) independent: f64,
+    pub(crate) iterations: u16,
+    /// Converged, or why not; neighbours have not been asked.
+    pub(crate) status: Status,
+    /// Standard uncertainties of u and v at the asked offset from the centre.
+    pub(crate) sigma: [f32; 2],
+}
+
+impl Outcome {
+    fn failed(status: Status, warp: Warp) -> Self {
+        Self {
+            warp,
+            zncc: f64::NAN,
+            independent: f64::NAN,
+            iterations: 0,
+            status,
+            sigma: [f32::NAN; 2],
+        }
+    }
+}
+
+impl<'a> Solver<'a> {
+    pub(crate) fn new(
+        reference: &'a Reference,
+        target: &'a Target,
+        settings: &'a Settings,
+        level: Level,
+    ) -> Self {
+        Self {
+            reference,
+            target,
+            settings,
+            layout: Layout::new(settings.radius()),
+            noise: NoiseGain::new(target.interpolation),
+            level,
+            scalar: false,
+        }
+    }
+
+    /// Whether the subset around (x, y) lies in the reference image.
+    pub(crate) fn fits(&self, x: i32, y: i32) -> bool {
+        let r = self.layout.radius as i32;
+        let (w, h) = (self.reference.image.width(), self.reference.image.height());
+        x >= r && y >= r && x + r < w as i32 && y + r < h as i32
+    }
+
+    /// Optimises the subset around pixel (x, y) from `guess`; uncertainties are stated at
+    /// `offset` from that pixel.
+    pub(crate) fn solve(
+        &self,
+        scratch: &mut Scratch,
+        (x, y): (i32, i32),
+        offset: [f64; 2],
+        guess: &Warp,
+    ) -> Outcome {
+        if !self.fits(x, y) {
+            return Outcome::failed(Status::OutOfImage, *guess);
+        }
+        use Interpolation::{Cubic, Quintic};
+        use Shape::{Affine, Quadratic, Translation};
+        let l = self.level;
+        macro_rules! run {
+            ($n:literal, $n1:literal, $o:literal) => {
+                dispatch!(l, s => iterate::<_, $n, $n1, $o>(s, self, scratch, x, y, offset, guess))
+            };
+        }
+        match (self.target.interpolation, self.settings.shape) {
+            (Quintic, Translation) => run!(6, 7, 0),
+            (Quintic, Affine) => run!(6, 7, 1),
+            (Quintic, Quadratic) => run!(6, 7, 2),
+            (Cubic, Translation) => run!(4, 5, 0),
+            (Cubic, Affine) => run!(4, 5, 1),
+            (Cubic, Quadratic) => run!(4, 5, 2),
+        }
+    }
+
+    /// Packs the subset around (x, y) into the scratch without iterating.
+    pub(crate) fn load(&self, scratch: &mut Scratch, x: i32, y: i32) {
+        if scratch.subset.centre == Some((x, y)) {
+            return;
+        }
+        dispatch!(self.level, s => load_translation(s, self, scratch, x, y));
+        // only the moments of order 0 were summed: the iteration must load again
+        scratch.normal = None;
+        scratch.subset.centre = None;
+    }
+
+    /// Whether the warped subset stays within `margin` pixels of the deformed image.
+    fn inside(&self, x: i32, y: i32, warp: &Warp, margin: f64) -> bool {
+        let r = self.layout.radius as f64;
+        let w = self.target.image.width() as f64 - 1.0 + margin;
+        let h = self.target.image.height() as f64 - 1.0 + margin;
+        [-r, 0.0, r].iter().all(|&eta| {
+            [-r, 0.0, r].iter().all(|&xi| {
+                let d = warp.at(xi, eta);
+                let (px, py) = (f64::from(x) + xi + d[0], f64::from(y) + eta + d[1]);
+                px >= -margin && py >= -margin && px <= w && py <= h
+            })
+        })
+    }
+
+    /// ZNCC that unrelated speckles of the subset's size reach only with the chosen significance.
+    fn threshold(&self, independent: f64) -> f64 {
+        significant(self.settings.significance, independent).max(self.settings.min_zncc)
+    }
+
+    /// Number of independent speckles in the subset: two unrelated fields of correlation lengths s
+    /// (autocorrelation exp(−d²/2s²) each, s² = Σf²/Σf_x²) have a ZNCC of variance π s_x s_y / n
+    /// over n pixels.
+    fn independent(&self, subset: &Subset) -> f64 {
+        let n = self.layout.count() as f64;
+        let gxx = subset.products[0][0].max(f64::MIN_POSITIVE);
+        let gyy = subset.products[2][0].max(f64::MIN_POSITIVE);
+        n * (gxx * gyy).sqrt() / (std::f64::consts::PI * subset.sff)
+    }
+
+    /// Standard uncertainties of u and v at an offset from the centre, from the inverse normal
+    /// matrix; gain and offset of the grey levels are free.
+    fn sigma(
+        &self,
+        subset: &Subset,
+        normal: &Normal,
+        warp: &Warp,
+        offset: [f64; 2],
+        zncc: f64,
+        gain: f64,
+    ) -> [f32; 2] {
+        let n = self.layout.count() as f64;
+        let r = self.layout.radius as f64;
+        let m = self.settings.shape.parameters_per_component();
+        // variance of the residual f − gain g if both images had the noise of whole pixels
+        let (residual, noise_f) = match self.settings.noise {
+            Some(s) => (s * s * (1.0 + gain * gain), s * s),
+            None => {
+                let freedom = (n - 2.0 - 2.0 * m as f64).max(1.0);
+                let raw = 2.0 * subset.sff * (1.0 - zncc).max(0.0) / freedom;
+                let mut energy = 0.0;
+                for eta in [-0.7 * r, 0.0, 0.7 * r] {
+                    for xi in [-0.7 * r, 0.0, 0.7 * r] {
+                        let d = warp.at(xi, eta);
+                        energy += self.noise.interpolated(d[0], d[1]) / 9.0;
+                    }
+                }
+                let s2 = raw * 2.0 / (1.0 + energy);
+                (s2, 0.5 * s2)
+            }
+        };
+        let (dx, dy) = (offset[0] / r, offset[1] / r);
+        let basis = [1.0, dx, dy, dx * dx, dx * dy, dy * dy];
+        let mut slopes_f = [0.0; MAX];
+        slopes_f[..m].copy_from_slice(&subset.slopes_f[0][..m]);
+        slopes_f[m..2 * m].copy_from_slice(&subset.slopes_f[1][..m]);
+        let coupled = normal.solve(slopes_f);
+        let mut out = [f32::NAN; 2];
+        for (c, o) in out.iter_mut().enumerate() {
+            let mut b = [0.0; MAX];
+            b[c * m..c * m + m].copy_from_slice(&basis[..m]);
+            let own = normal.quadratic_form(b);
+            let through_gain: f64 = b.iter().zip(&coupled).map(|(a, e)| a * e).sum();
+            // noise in the gradients makes the normal matrix look better than it is
+            let excess = n * self.noise.gradient * noise_f / subset.products[2 * c][0];
+            let honest = (1.0 - excess).max(0.2);
+            let variance =
+                residual * (own + through_gain * through_gain / subset.sff) / (honest * honest);
+            *o = variance.max(0.0).sqrt() as f32;
+        }
+        out
+    }
+}
+
+#[simd]
+fn load_translation<S: Simd>(s: S, solver: &Solver<'_>, scratch: &mut Scratch, x: i32, y: i32) {
+    scratch
+        .subset
+        .load::<S, 0>(s, &solver.layout, solver.reference, x, y);
+}
+
+#[simd]
+fn iterate<S: Simd, const N: usize, const N1: usize, const O: usize>(
+    s: S,
+    solver: &Solver<'_>,
+    scratch: &mut Scratch,
+    x: i32,
+    y: i32,
+    offset: [f64; 2],
+    guess: &Warp,
+) -> Outcome {
+    let settings = solver.settings;
+    let layout = &solver.layout;
+    let m = settings.shape.parameters_per_component();
+    let n = layout.count() as f64;
+    let r = layout.radius as f64;
+    let mut warp = guess.restricted(settings.shape);
+    if scratch.subset.centre != Some((x, y)) {
+        if solver.scalar {
+            scalar::load(&mut scratch.subset, layout, solver.reference, x, y, O);
+        } else {
+            scratch
+                .subset
+                .load::<S, O>(s, layout, solver.reference, x, y);
+        }
+        scratch.normal = Normal::new(&scratch.subset, m, n);
+    }
+    let subset = &scratch.subset;
+    // rounding of single precision over the subset's grey range
+    let floor = 1e-10 * n * subset.mean * subset.mean;
+    if subset.sff <= floor {
+        return Outcome::failed(Status::LowTexture, warp);
+    }
+    let Some(normal) = &scratch.normal else {
+        return Outcome::failed(Status::Singular, warp);
+    };
+    let mut out = Outcome::failed(Status::NotConverged, warp);
+    out.independent = solver.independent(subset);
+    let mut gain = 1.0;
+    while u32::from(out.iterations) < settings.max_iterations {
+        if !solver.inside(x, y, &warp, OVERHANG) {
+            out.status = Status::OutOfImage;
+            break;
+        }
+        let far = (warp.0[0][0] - guess.0[0][0])
+            .abs()
+            .max((warp.0[1][0] - guess.0[1][0]).abs());
+        if far > r {
+            break;
+        }
+        let base = [warp.0[0][0].round(), warp.0[1][0].round()];
+        let mut at = Sampling {
+            x: x + base[0] as i32,
+            y: y + base[1] as i32,
+            u: warp.0[0],
+            v: warp.0[1],
+            mean: (subset.mean - f64::from(solver.target.offset)) as f32,
+        };
+        at.u[0] -= base[0];
+        at.v[0] -= base[1];
+        let plane = &solver.target.coefficients;
+        let sums = if solver.scalar {
+            scalar::sweep(layout, subset, plane, &at, N, O)
+        } else {
+            sweep::<S, N, N1, O>(s, layout, subset, plane, &at, &mut scratch.warped)
+        };
+        let Some((increment, zncc, a)) = step(subset, normal, &sums, m, n, r) else {
+            break;
+        };
+        out.zncc = zncc;
+        gain = a;
+        out.iterations += 1;
+        let Some(next) = warp.updated(&increment) else {
+            break;
+        };
+        warp = next;
+        if edge_motion(&increment, r) < settings.tolerance {
+            out.status = Status::Converged;
+            break;
+        }
+    }
+    out.warp = warp;
+    if out.status == Status::Converged {
+        out.sigma = solver.sigma(subset, normal, &warp, offset, out.zncc, gain);
+        out.status = if !solver.inside(x, y, &warp, BORDER) {
+            Status::OutOfImage
+        } else if out.zncc < solver.threshold(out.independent) {
+            Status::LowCorrelation
+        } else if warp.log_stretch() > settings.max_log_stretch {
+            Status::Distorted
+        } else {
+            Status::Converged
+        };
+    }
+    out
+}
+
+/// ZNCC that lies `sigmas` standard deviations above chance (Fisher's z). Small subsets would need
+/// more than noise leaves them: they are let through at 0.9 and judged by their neighbours.
+pub(crate) fn significant(sigmas: f64, independent: f64) -> f64 {
+    (sigmas / (independent - 3.0).max(1.0).sqrt()).tanh().min(0.9)
+}
+
+/// Increment in pixels, ZNCC before it, and the gain from deformed to reference grey levels.
+fn step(
+    subset: &Subset,
+    normal: &Normal,
+    sums: &Sums,
+    m: usize,
+    n: f64,
+    r: f64,
+) -> Option<(Warp, f64, f64)> {
+    let mean = sums.q / n;
+    let sff = subset.sff;
+    let sfg = sff - sums.fq;
+    let sgg = sff - 2.0 * sums.fq + (sums.qq - sums.q * mean);
+    if !(sgg > 1e-9 * sff && sgg.is_finite()) {
+        return None;
+    }
+    // Ratio of the standard deviations, not the regression of f on g: noise in g biases the latter.
+    let gain = (sff / sgg).sqrt();
+    let zncc = sfg / (sff * sgg).sqrt();
+    let mut b = [0.0; MAX];
+    for c in 0..2 {
+        for k in 0..m {
+            b[c * m + k] = (1.0 - gain) * subset.slopes_f[c][k]
+                + gain * (sums.slopes[c][k] - mean * subset.slopes[c][k]);
+        }
+    }
+    let d = normal.solve(b);
+    // residual f − g = −Gᵀ Δp; back from ξ/r to ξ
+    let scale = [1.0, r, r, r * r, r * r, r * r];
+    let mut w = [[0.0; 6]; 2];
+    for c in 0..2 {
+        for k in 0..m {
+            w[c][k] = -d[c * m + k] / scale[k];
+        }
+    }
+    Some((Warp(w), zncc, gain))
+}
+
+/// Norm of an increment as a motion of the subset's edge.
+fn edge_motion(increment: &Warp, r: f64) -> f64 {
+    let scale = [1.0, r, r, r * r, r * r, r * r];
+    increment
+        .0
+        .iter()
+        .flat_map(|c| c.iter().zip(&scale).map(|(a, s)| (a * s).powi(2)))
+        .sum::<f64>()
+        .sqrt()
+}

@@ -1,0 +1,117 @@
+//! How the interpolating splines pass white noise on; needed to turn residuals into uncertainties.
+
+use crate::settings::Interpolation;
+
+/// Half length of the impulse responses kept; 0.43^40 is far below rounding.
+const REACH: i64 = 40;
+const STEPS: usize = 32;
+
+/// Noise properties of one interpolation.
+#[derive(Debug, Clone)]
+pub(crate) struct NoiseGain {
+    /// Σ h(t + k)² for t = 0, 1/32, … 1: the variance of an interpolated value, per unit of pixel
+    /// variance, along one axis.
+    energy: [f64; STEPS + 1],
+    /// Σ h′(k)² of the quintic: the variance of a gradient value.
+    pub(crate) gradient: f64,
+}
+
+/// Centred B-spline of degree `n` by the de Boor recursion.
+fn spline(n: u32, x: f64) -> f64 {
+    if n == 0 {
+        return if (-0.5..0.5).contains(&x) { 1.0 } else { 0.0 };
+    }
+    let half = f64::from(n + 1) / 2.0;
+    if x.abs() >= half {
+        return 0.0;
+    }
+    ((half + x) * spline(n - 1, x + 0.5) + (half - x) * spline(n - 1, x - 0.5)) / f64::from(n)
+}
+
+/// Coefficients c(k) of the cardinal spline: the inverse of the sampled B-spline.
+fn cardinal(n: u32) -> Vec<f64> {
+    let poles: &[f64] = if n == 3 {
+        &[-0.267_949_192_431_122_7]
+    } else {
+        &[-0.430_575_347_099_973_8, -0.043_096_288_203_264_65]
+    };
+    let len = (2 * REACH + 1) as usize;
+    let mut c = vec![0.0; len];
+    c[REACH as usize] = 1.0;
+    for &z in poles {
+        for k in 1..len {
+            c[k] += z * c[k - 1];
+        }
+        for k in (0..len - 1).rev() {
+            c[k] += z * c[k + 1];
+        }
+        let gain = (1.0 - z) * (1.0 - z);
+        c.iter_mut().for_each(|v| *v *= gain);
+    }
+    c
+}
+
+impl NoiseGain {
+    pub(crate) fn new(kind: Interpolation) -> Self {
+        let n = match kind {
+            Interpolation::Cubic => 3,
+            Interpolation::Quintic => 5,
+        };
+        let value = |c: &[f64], n: u32, x: f64| -> f64 {
+            let near = x.round() as i64;
+            (near - 3..=near + 3)
+                .filter(|k| k.abs() <= REACH)
+                .map(|k| c[(k + REACH) as usize] * spline(n, x - k as f64))
+                .sum()
+        };
+        let c = cardinal(n);
+        let mut energy = [0.0; STEPS + 1];
+        for (i, e) in energy.iter_mut().enumerate() {
+            let t = i as f64 / STEPS as f64;
+            *e = (-20..=20)
+                .map(|k| value(&c, n, t + f64::from(k)).powi(2))
+                .sum();
+        }
+        let c = cardinal(5);
+        // β5′(x) = β4(x + ½) − β4(x − ½)
+        let slope = |k: i64| -> f64 {
+            (k - 3..=k + 3)
+                .map(|j| {
+                    let x = (k - j) as f64;
+                    c[(j + REACH) as usize] * (spline(4, x + 0.5) - spline(4, x - 0.5))
+                })
+                .sum()
+        };
+        let gradient = (-20..=20).map(|k| slope(k).powi(2)).sum();
+        Self { energy, gradient }
+    }
+
+    /// Variance of an interpolated value at a sub-pixel position, per unit of pixel variance.
+    pub(crate) fn interpolated(&self, u: f64, v: f64) -> f64 {
+        let one = |t: f64| {
+            let p = (t - t.floor()) * STEPS as f64;
+            let i = (p as usize).min(STEPS - 1);
+            self.energy[i] + (p - i as f64) * (self.energy[i + 1] - self.energy[i])
+        };
+        one(u) * one(v)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn interpolated_noise_is_whole_at_pixels_and_less_between() {
+        for kind in [Interpolation::Cubic, Interpolation::Quintic] {
+            let g = NoiseGain::new(kind);
+            assert!((g.interpolated(3.0, -2.0) - 1.0).abs() < 1e-9);
+            let half = g.interpolated(0.5, 0.0);
+            assert!(half > 0.6 && half < 0.9, "{half}");
+            assert!((g.interpolated(0.3, 0.0) - g.interpolated(0.7, 0.0)).abs() < 1e-9);
+        }
+        // π²/3 for an ideal band-limited derivative; the quintic rolls off near Nyquist
+        let g = NoiseGain::new(Interpolation::Quintic).gradient;
+        assert!(g > 1.0 && g < 3.29, "{g}");
+    }
+}

@@ -1,0 +1,274 @@
+//! One reference subset, packed for streaming, with the moments that make its normal equations.
+
+use crate::prepared::Reference;
+use crate::sampler::V;
+use fearless_simd::prelude::*;
+
+pub(crate) const LANES: usize = 8;
+
+/// How a square subset is cut into groups of eight pixels: along its rows, with one or two columns
+/// left over cut down the columns (33 = 4·8 + 1), or with a partly filled group at each row's end.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Layout {
+    pub(crate) radius: usize,
+    pub(crate) width: usize,
+    /// Groups per row.
+    pub(crate) groups: usize,
+    /// Pixels in the last group of each row.
+    pub(crate) last: usize,
+    /// Columns treated downwards.
+    pub(crate) columns: usize,
+}
+
+impl Layout {
+    pub(crate) fn new(radius: usize) -> Self {
+        let width = 2 * radius + 1;
+        let rest = width % LANES;
+        if width > LANES && rest <= 2 {
+            Self {
+                radius,
+                width,
+                groups: width / LANES,
+                last: LANES,
+                columns: rest,
+            }
+        } else {
+            Self {
+                radius,
+                width,
+                groups: width.div_ceil(LANES),
+                last: if rest == 0 { LANES } else { rest },
+                columns: 0,
+            }
+        }
+    }
+
+    /// Pixels of the subset.
+    pub(crate) fn count(&self) -> usize {
+        self.width * self.width
+    }
+
+    /// Groups down one column.
+    pub(crate) fn column_groups(&self) -> usize {
+        self.width.div_ceil(LANES)
+    }
+
+    fn floats(&self) -> usize {
+        (self.width * self.groups + self.columns * self.column_groups()) * LANES
+    }
+}
+
+/// Monomials ξ^i η^j in the order 1, ξ, η, ξ², ξη, η², ξ³, …
+pub(crate) const fn monomial(i: usize, j: usize) -> usize {
+    let d = i + j;
+    d * (d + 1) / 2 + j
+}
+
+/// A reference subset: grey levels minus their mean and the gradients, group after group; unused
+/// lanes are zero. Coordinates in the moments are ξ/r and η/r.
+#[derive(Default, Clone)]
+pub(crate) struct Subset {
+    pub(crate) centre: Option<(i32, i32)>,
+    pub(crate) f: Vec<f32>,
+    pub(crate) gx: Vec<f32>,
+    pub(crate) gy: Vec<f32>,
+    pub(crate) mean: f64,
+    /// Σ (f − mean)².
+    pub(crate) sff: f64,
+    /// Σ fx², Σ fx fy, Σ fy², each times the monomials up to twice the shape's order.
+    pub(crate) products: [[f64; 15]; 3],
+    /// Σ fx, Σ fy times the monomials of the shape.
+    pub(crate) slopes: [[f64; 6]; 2],
+    /// Σ fx (f − mean), Σ fy (f − mean) times the monomials of the shape.
+    pub(crate) slopes_f: [[f64; 6]; 2],
+}
+
+impl Subset {
+    /// Copies the subset around (x, y), which must lie in the image, and sums its moments for a
+    /// shape function of order O.
+    #[inline(always)]
+    pub(crate) fn load<S: Simd, const O: usize>(
+        &mut self,
+        s: S,
+        layout: &Layout,
+        reference: &Reference,
+        x: i32,
+        y: i32,
+    ) {
+        self.copy(layout, reference, x, y);
+        let zero = V::splat(s, 0.0);
+        let n = layout.count() as f64;
+        let mut sum = zero;
+        for c in self.f.chunks_exact(LANES) {
+            sum = sum + V::from_slice(s, c);
+        }
+        // grey levels were copied relative to the centre pixel: the sum stays small
+        let shift = f64::from(sum.reduce_sum()) / n;
+        self.mean += shift;
+        self.subtract(s, layout, shift as f32);
+        self.moments::<S, O>(s, layout);
+        self.centre = Some((x, y));
+    }
+
+    #[inline(always)]
+    fn copy(&mut self, layout: &Layout, reference: &Reference, x: i32, y: i32) {
+        let floats = layout.floats();
+        if self.f.len() != floats {
+            for v in [&mut self.f, &mut self.gx, &mut self.gy] {
+                v.clear();
+                v.resize(floats, 0.0);
+            }
+        }
+        let r = layout.radius;
+        let (x0, y0) = (x as usize - r, y as usize - r);
+        let image = &reference.image;
+        let centre = image.row(y as usize)[x as usize];
+        self.mean = f64::from(centre);
+        let row_floats = layout.groups * LANES;
+        let used = (layout.groups - 1) * LANES + layout.last;
+        for d in 0..layout.width {
+            let at = d * row_floats;
+            let src = &image.row(y0 + d)[x0..x0 + layout.width];
+            for (o, &g) in self.f[at..at + used].iter_mut().zip(src) {
+                *o = g - centre;
+            }
+            let o = reference.gx.index(x0 as i32, (y0 + d) as i32);
+            self.gx[at..at + used].copy_from_slice(&reference.gx.data[o..o + used]);
+            self.gy[at..at + used].copy_from_slice(&reference.gy.data[o..o + used]);
+        }
+        for c in 0..layout.columns {
+            let at = layout.width * row_floats + c * layout.column_groups() * LANES;
+            let col = x0 + layout.groups * LANES + c;
+            for d in 0..layout.width {
+                self.f[at + d] = image.row(y0 + d)[col] - centre;
+                let o = reference.gx.index(col as i32, (y0 + d) as i32);
+                self.gx[at + d] = reference.gx.data[o];
+                self.gy[at + d] = reference.gy.data[o];
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn subtract<S: Simd>(&mut self, s: S, layout: &Layout, mean: f32) {
+        let m = V::splat(s, mean);
+        for c in self.f.chunks_exact_mut(LANES) {
+            (V::from_slice(s, c) - m).store_slice(c);
+        }
+        let row_floats = layout.groups * LANES;
+        let rows = layout.width * row_floats;
+        if layout.last < LANES {
+            for row in self.f[..rows].chunks_exact_mut(row_floats) {
+                row[row_floats - LANES + layout.last..].fill(0.0);
+            }
+        }
+        for column in self.f[rows..].chunks_exact_mut(layout.column_groups() * LANES) {
+            column[layout.width..].fill(0.0);
+        }
+    }
+
+    #[inline(always)]
+    fn moments<S: Simd, const O: usize>(&mut self, s: S, layout: &Layout) {
+        let zero = V::splat(s, 0.0);
+        let lanes = V::from_fn(s, |l| l as f32);
+        let r = layout.radius as f32;
+        let rinv = 1.0 / r;
+        let mut h = [[zero; 15]; 3];
+        let mut g = [[zero; 6]; 2];
+        let mut gf = [[zero; 6]; 2];
+        let mut sff = zero;
+        let row_floats = layout.groups * LANES;
+        let rows = layout.width * row_floats;
+        for d in 0..layout.width {
+            let (mut th, mut tg, mut tf) = ([[zero; 5]; 3], [[zero; 3]; 2], [[zero; 3]; 2]);
+            let at = d * row_floats;
+            let f = &self.f[at..at + row_floats];
+            let gx = &self.gx[at..at + row_floats];
+            let gy = &self.gy[at..at + row_floats];
+            for k in (0..row_floats).step_by(LANES) {
+                let e = (lanes + V::splat(s, k as f32 - r)) * V::splat(s, rinv);
+                let fv = V::from_slice(s, &f[k..k + LANES]);
+                let xv = V::from_slice(s, &gx[k..k + LANES]);
+                let yv = V::from_slice(s, &gy[k..k + LANES]);
+                sff = fv.mul_add(fv, sff);
+                let mut p = [xv * xv, xv * yv, yv * yv];
+                let mut q = [xv, yv];
+                for i in 0..=2 * O {
+                    for c in 0..3 {
+                        th[c][i] = th[c][i] + p[c];
+                        p[c] = p[c] * e;
+                    }
+                }
+                for i in 0..=O {
+                    for c in 0..2 {
+                        tg[c][i] = tg[c][i] + q[c];
+                        tf[c][i] = q[c].mul_add(fv, tf[c][i]);
+                        q[c] = q[c] * e;
+                    }
+                }
+            }
+            let eta = V::splat(s, (d as f32 - r) * rinv);
+            let mut power = V::splat(s, 1.0);
+            for j in 0..=2 * O {
+                for i in 0..=2 * O - j {
+                    for c in 0..3 {
+                        h[c][monomial(i, j)] = th[c][i].mul_add(power, h[c][monomial(i, j)]);
+                    }
+                }
+                if j <= O {
+                    for i in 0..=O - j {
+                        for c in 0..2 {
+                            let m = monomial(i, j);
+                            g[c][m] = tg[c][i].mul_add(power, g[c][m]);
+                            gf[c][m] = tf[c][i].mul_add(power, gf[c][m]);
+                        }
+                    }
+                }
+                power = power * eta;
+            }
+        }
+        let column_floats = layout.column_groups() * LANES;
+        for c in 0..layout.columns {
+            let at = rows + c * column_floats;
+            let e = V::splat(s, ((layout.groups * LANES + c) as f32 - r) * rinv);
+            for k in (0..column_floats).step_by(LANES) {
+                let eta = (lanes + V::splat(s, k as f32 - r)) * V::splat(s, rinv);
+                let fv = V::from_slice(s, &self.f[at + k..at + k + LANES]);
+                let xv = V::from_slice(s, &self.gx[at + k..at + k + LANES]);
+                let yv = V::from_slice(s, &self.gy[at + k..at + k + LANES]);
+                sff = fv.mul_add(fv, sff);
+                let (pp, qq) = ([xv * xv, xv * yv, yv * yv], [xv, yv]);
+                let mut power = V::splat(s, 1.0);
+                for j in 0..=2 * O {
+                    let mut m = power;
+                    for i in 0..=2 * O - j {
+                        for c in 0..3 {
+                            h[c][monomial(i, j)] = pp[c].mul_add(m, h[c][monomial(i, j)]);
+                        }
+                        if i + j <= O {
+                            for c in 0..2 {
+                                let a = monomial(i, j);
+                                let t = qq[c] * m;
+                                g[c][a] = g[c][a] + t;
+                                gf[c][a] = t.mul_add(fv, gf[c][a]);
+                            }
+                        }
+                        m = m * e;
+                    }
+                    power = power * eta;
+                }
+            }
+        }
+        self.sff = f64::from(sff.reduce_sum());
+        for c in 0..3 {
+            for k in 0..monomial(0, 2 * O) + 1 {
+                self.products[c][k] = f64::from(h[c][k].reduce_sum());
+            }
+        }
+        for c in 0..2 {
+            for k in 0..monomial(0, O) + 1 {
+                self.slopes[c][k] = f64::from(g[c][k].reduce_sum());
+                self.slopes_f[c][k] = f64::from(gf[c][k].reduce_sum());
+            }
+        }
+    }
+}

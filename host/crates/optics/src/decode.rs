@@ -1,0 +1,238 @@
+//! From a pixel pair to a point, by three models behind one interface.
+
+use nalgebra::{Matrix3, Matrix3x4, Matrix4, Vector3};
+use serde::{Deserialize, Serialize};
+
+use crate::model::{OpticalModel, Setup, TraceError};
+use crate::real::{Dual, Real, along, dot, sub};
+use crate::setup::{Parameter, View};
+
+/// How a pixel pair becomes a point.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Decoder {
+    /// The grating equation itself: both lines of sight are traced and the point is the middle of
+    /// the shortest segment between them. Exact for any pose and substrate.
+    #[default]
+    Ray,
+    /// Virtual object at z/cos³θ, solved exactly: z = u s / (2 F t − u/c³).
+    Closed,
+    /// The same, linearised in the height about the reference plane, as in the literature.
+    Linear,
+}
+
+/// Pixels of one material point in the two views.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PixelPair {
+    /// (x₋, y₋) in the −1 view.
+    pub minus_px: [f64; 2],
+    /// (x₊, y₊) in the +1 view.
+    pub plus_px: [f64; 2],
+}
+
+impl PixelPair {
+    /// From the pixel in the −1 view and the displacement (u, v) to the +1 view.
+    pub fn from_disparity(minus_px: [f64; 2], u: f64, v: f64) -> Self {
+        Self { minus_px, plus_px: [minus_px[0] + u, minus_px[1] + v] }
+    }
+
+    /// The pixel in `view`.
+    pub fn pixel(&self, view: View) -> [f64; 2] {
+        match view {
+            View::Minus => self.minus_px,
+            View::Plus => self.plus_px,
+        }
+    }
+
+    fn coordinates(&self) -> [f64; 4] {
+        let ([a, b], [c, d]) = (self.minus_px, self.plus_px);
+        [a, b, c, d]
+    }
+}
+
+/// Covariance (px²) of (x₋, y₋, x₊, y₊) from independent standard deviations.
+pub fn pixel_covariance(sigma_minus_px: [f64; 2], sigma_plus_px: [f64; 2]) -> Matrix4<f64> {
+    let ([a, b], [c, d]) = (sigma_minus_px, sigma_plus_px);
+    Matrix4::from_diagonal(&nalgebra::Vector4::new(a * a, b * b, c * c, d * d))
+}
+
+/// A decoded point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Decoded {
+    /// (x, y, h) in millimetres.
+    pub point_mm: Vector3<f64>,
+    /// How far the pair is from meeting, ≥ 0: for [`Decoder::Ray`] the shortest distance of the
+    /// two lines of sight; for the virtual-object models |v| on the scale of the object.
+    pub gap_mm: f64,
+    /// ∂(x, y, h)/∂(x₋, y₋, x₊, y₊), mm/px.
+    pub jacobian: Matrix3x4<f64>,
+}
+
+impl Decoded {
+    /// Covariance (mm²) of the point from that of the four pixel coordinates (px²).
+    pub fn covariance_mm2(&self, pixels: &Matrix4<f64>) -> Matrix3<f64> {
+        self.jacobian * pixels * self.jacobian.transpose()
+    }
+}
+
+/// Displacement of a material point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Displacement {
+    /// The point before.
+    pub reference: Decoded,
+    /// The point after.
+    pub deformed: Decoded,
+    /// Displacement (x, y, h) in millimetres.
+    pub displacement_mm: Vector3<f64>,
+    /// Its covariance in mm², from the pixels alone.
+    pub covariance_mm2: Matrix3<f64>,
+}
+
+impl OpticalModel {
+    /// Point seen by a pixel pair.
+    ///
+    /// # Errors
+    /// If an input is not finite, the distortion cannot be undone, an order does not propagate,
+    /// or the lines of sight do not meet behind the grating.
+    pub fn decode(&self, decoder: Decoder, pair: PixelPair) -> Result<Decoded, TraceError> {
+        let c = pair.coordinates();
+        let v = |i: usize| Dual::<4>::variable(c[i], i);
+        let (p, gap_mm) = decode(&self.by_pair, decoder, [v(0), v(1)], [v(2), v(3)])?;
+        Ok(Decoded {
+            point_mm: p.map(|p| p.value).into(),
+            gap_mm,
+            jacobian: Matrix3x4::from_fn(|i, j| p[i].gradient[j]),
+        })
+    }
+
+    /// As [`OpticalModel::decode`], the point alone: cheaper where no Jacobian is needed.
+    ///
+    /// # Errors
+    /// As [`OpticalModel::decode`].
+    pub fn decode_point(&self, decoder: Decoder, pair: PixelPair) -> Result<Vector3<f64>, TraceError> {
+        let (p, _) = decode(&self.plain, decoder, pair.minus_px, pair.plus_px)?;
+        Ok(p.into())
+    }
+
+    /// Derivatives (3×3) of the decoded point with respect to [`Parameter::ALL`], in this order:
+    /// what the covariance of a calibration does to a point, in common for all points.
+    ///
+    /// # Errors
+    /// As [`OpticalModel::decode`].
+    pub fn parameter_jacobian(&self, decoder: Decoder, pair: PixelPair) -> Result<Matrix3<f64>, TraceError> {
+        const { assert!(Parameter::ALL.len() == 3) };
+        let constant = |p: [f64; 2]| p.map(Dual::<3>::constant);
+        let (p, _) = decode(&self.by_parameters, decoder, constant(pair.minus_px), constant(pair.plus_px))?;
+        Ok(Matrix3::from_fn(|i, j| p[i].gradient[j]))
+    }
+
+    /// Displacement of a material point tracked in both views.
+    ///
+    /// `reference_px2` is the covariance (px²) of the pair in the reference frame (the match
+    /// between the views), `tracking_px2` that of the four increments from it to the deformed
+    /// frame. An error of the reference pair moves both points and all but cancels in the
+    /// difference; the increments do not.
+    ///
+    /// # Errors
+    /// As [`OpticalModel::decode`].
+    pub fn displacement(
+        &self,
+        decoder: Decoder,
+        reference: PixelPair,
+        deformed: PixelPair,
+        reference_px2: &Matrix4<f64>,
+        tracking_px2: &Matrix4<f64>,
+    ) -> Result<Displacement, TraceError> {
+        let reference = self.decode(decoder, reference)?;
+        let deformed = self.decode(decoder, deformed)?;
+        let common = deformed.jacobian - reference.jacobian;
+        Ok(Displacement {
+            reference,
+            deformed,
+            displacement_mm: deformed.point_mm - reference.point_mm,
+            covariance_mm2: common * reference_px2 * common.transpose()
+                + deformed.covariance_mm2(tracking_px2),
+        })
+    }
+}
+
+fn decode<T: Real>(
+    setup: &Setup<T>,
+    decoder: Decoder,
+    minus: [T; 2],
+    plus: [T; 2],
+) -> Result<([T; 3], f64), TraceError> {
+    let finite = |p: [T; 2]| p.iter().all(|c| c.value().is_finite());
+    if !(finite(minus) && finite(plus)) {
+        return Err(TraceError::NotFinite);
+    }
+    let minus = setup.camera.direction(minus)?;
+    let plus = setup.camera.direction(plus)?;
+    match decoder {
+        Decoder::Ray => by_rays(setup, minus, plus),
+        Decoder::Closed | Decoder::Linear => {
+            by_virtual_object(setup, decoder == Decoder::Linear, minus, plus)
+        }
+    }
+}
+
+fn by_rays<T: Real>(setup: &Setup<T>, minus: [T; 2], plus: [T; 2]) -> Result<([T; 3], f64), TraceError> {
+    let a = setup.trace(View::Minus, minus)?;
+    let b = setup.trace(View::Plus, plus)?;
+    // Lines a + s·da and b + t·db with unit directions; the shortest segment is normal to both.
+    let w = sub(a.origin, b.origin);
+    let cos = dot(a.direction, b.direction);
+    let (wa, wb) = (dot(w, a.direction), dot(w, b.direction));
+    let sin2 = T::constant(1.0) - cos * cos;
+    if sin2.value() < 1e-12 {
+        return Err(TraceError::NoIntersection);
+    }
+    let on_a = along(a.origin, a.direction, (cos * wb - wa) / sin2);
+    let on_b = along(b.origin, b.direction, (wb - cos * wa) / sin2);
+    let half = T::constant(0.5);
+    let middle = [0, 1, 2].map(|i| (on_a[i] + on_b[i]) * half);
+    for view in View::BOTH {
+        let distance_mm = setup.behind(view, middle);
+        if !(distance_mm > 0.0) {
+            return Err(TraceError::BeforeGrating { distance_mm });
+        }
+    }
+    let gap = sub(on_a, on_b).map(T::value);
+    Ok((setup.object(middle), dot(gap, gap).sqrt()))
+}
+
+/// The paraxial models, with pixels already free of distortion and divided by F.
+fn by_virtual_object<T: Real>(
+    setup: &Setup<T>,
+    linear: bool,
+    minus: [T; 2],
+    plus: [T; 2],
+) -> Result<([T; 3], f64), TraceError> {
+    let one = T::constant(1.0);
+    let half = T::constant(0.5);
+    let (s, d) = (setup.s, setup.d);
+    let sin = setup.mean_sin_theta;
+    let cos = (one - sin * sin).sqrt();
+    let (tan, c3) = (sin / cos, cos * cos * cos);
+    // u*/F, v*/F and the middle of the two views.
+    let (u, v) = (plus[0] - minus[0], plus[1] - minus[1]);
+    let middle = [minus[0] + u * half, minus[1] + v * half];
+    let (h, scale) = if linear {
+        let scale = s + d / c3;
+        let h = (d - scale * u / (tan + tan)) * (one + d / (s * c3));
+        (h, scale / (one + h / (s * c3 + d)))
+    } else {
+        let below = tan + tan - u / c3;
+        if !(below.value() > 0.0) {
+            return Err(TraceError::NoIntersection);
+        }
+        let z = u * s / below;
+        (d - z, s + z / c3)
+    };
+    let distance_mm = (d - h).value();
+    if !(distance_mm > 0.0) {
+        return Err(TraceError::BeforeGrating { distance_mm });
+    }
+    let gap = (v * scale).value().abs();
+    Ok(([middle[0] * scale, middle[1] * scale, h], gap))
+}

@@ -1,0 +1,157 @@
+//! `[rig]`: trigger box, stage, camera, LEDs.
+
+use crate::units::{Acceleration, Length, Speed, Time};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+
+/// Trigger box, stage, camera and strobe.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Rig {
+    /// Where the box is: a serial port, `tcp://host:port`, or `sim` for the simulated rig.
+    #[serde(default = "sim")]
+    pub port: String,
+    /// Bits per second of a serial port (USB ignores it).
+    #[serde(default = "baud")]
+    pub baud: u32,
+    /// How long to wait for one reply before asking again.
+    #[serde(default = "reply_timeout")]
+    pub reply_timeout: Time,
+    /// How long to wait for frames after the last trigger.
+    #[serde(default = "frame_timeout")]
+    pub frame_timeout: Time,
+    /// The camera and its trigger line.
+    pub camera: CameraSection,
+    /// The strobe that lights a frame unless the frame has its own.
+    pub strobe: Strobe,
+    /// Stage axes.
+    #[serde(default)]
+    pub axes: Axes,
+}
+
+/// The camera and its trigger line.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct CameraSection {
+    /// Where frames come from.
+    #[serde(default)]
+    pub source: CameraSource,
+    /// Trigger line of the box, 0…3.
+    #[serde(default)]
+    pub line: u8,
+    /// Sensor columns.
+    pub width: u32,
+    /// Sensor rows.
+    pub height: u32,
+    /// Significant bits of a grey level, 8…16.
+    #[serde(default = "bits")]
+    pub bits: u8,
+    /// How long the trigger line stays high.
+    #[serde(default = "trigger_width")]
+    pub trigger_width: Time,
+    /// From the rising trigger edge to the begin of the exposure.
+    #[serde(default = "zero")]
+    pub exposure_delay: Time,
+    /// How long the sensor integrates.
+    pub exposure: Time,
+    /// From the end of the exposure until the camera takes the next trigger.
+    #[serde(default = "readout")]
+    pub readout: Time,
+}
+
+/// Where frames come from.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum CameraSource {
+    /// The simulated camera.
+    #[default]
+    Sim,
+    /// Image files of a folder, in natural order of their names.
+    Folder(PathBuf),
+}
+
+/// A strobe: one LED pulse inside the exposure.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Strobe {
+    /// LED line, 0…7.
+    #[serde(default)]
+    pub led: u8,
+    /// From the rising trigger edge to LED on.
+    pub delay: Time,
+    /// How long the LED is on.
+    pub width: Time,
+    /// Current level, 0…1 of full scale; left out, the level last set (1 before any).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub level: Option<f64>,
+    /// Time the driver needs after a new level.
+    #[serde(default = "level_settle")]
+    pub level_settle: Time,
+}
+
+/// Stage axes that are there.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Axes {
+    /// x, axis 0 of the box: to the right on the sensor.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub x: Option<Axis>,
+    /// y, axis 1 of the box: down on the sensor.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub y: Option<Axis>,
+    /// z, axis 2 of the box: towards the camera.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub z: Option<Axis>,
+}
+
+impl Axes {
+    /// Name and axis in the order of the box (x, y, z).
+    pub fn named(&self) -> [(&'static str, Option<&Axis>); 3] {
+        [("x", self.x.as_ref()), ("y", self.y.as_ref()), ("z", self.z.as_ref())]
+    }
+}
+
+/// One stage axis.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Axis {
+    /// Step pulses per millimetre.
+    pub steps_per_mm: f64,
+    /// Lowest position a move may ask for.
+    pub min: Length,
+    /// Highest position a move may ask for.
+    pub max: Length,
+    /// Highest speed.
+    pub rate: Speed,
+    /// Acceleration.
+    pub acceleration: Acceleration,
+}
+
+fn sim() -> String {
+    "sim".to_owned()
+}
+fn baud() -> u32 {
+    115_200
+}
+fn reply_timeout() -> Time {
+    Time::new(200e6)
+}
+fn frame_timeout() -> Time {
+    Time::new(5e9)
+}
+fn bits() -> u8 {
+    8
+}
+fn trigger_width() -> Time {
+    Time::new(10e3)
+}
+fn zero() -> Time {
+    Time::new(0.0)
+}
+fn readout() -> Time {
+    Time::new(20e6)
+}
+fn level_settle() -> Time {
+    Time::new(2e6)
+}

@@ -1,0 +1,245 @@
+//! Commands and their flags.
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+
+/// Measures 3D shape and displacement with one camera behind a transmission grating.
+#[derive(Debug, Parser)]
+#[command(version, about, max_term_width = 100, arg_required_else_help = true)]
+pub struct Cli {
+    #[command(subcommand)]
+    pub command: Command,
+    /// Print exactly one JSON object on stdout
+    #[arg(long, global = true)]
+    pub json: bool,
+    /// No progress on stderr
+    #[arg(long, short, global = true)]
+    pub quiet: bool,
+    /// Threads to compute with (default: all cores); results do not depend on it
+    #[arg(long, global = true, value_name = "N")]
+    pub threads: Option<NonZeroUsize>,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Run the whole instrument against the simulated rig: a commanded move comes back as a measured one
+    #[cfg(feature = "sim")]
+    Demo(DemoArgs),
+    /// Run an experiment on the simulated rig and write a dataset
+    #[cfg(feature = "sim")]
+    Simulate(SimulateArgs),
+    /// Run an experiment on a rig at a port and write a dataset
+    Run(RunArgs),
+    /// Measure everything in a recorded dataset; takes up where it was interrupted
+    Process(ProcessArgs),
+    /// Correlate two images (2D-DIC)
+    Correlate(CorrelateArgs),
+    /// Height map of one frame with both first-order views
+    Profile(ProfileArgs),
+    /// 3D displacement from one frame with both views to another
+    Displacement(DisplacementArgs),
+    /// Write a commented experiment file
+    Init(InitArgs),
+    /// Print the JSON schema of the experiment file
+    Schema,
+    /// Say what is here: ports, board, camera, threads, SIMD
+    Doctor(DoctorArgs),
+}
+
+#[derive(Debug, Args)]
+pub struct DemoArgs {
+    /// Folder for the dataset and the report
+    #[arg(long, value_name = "DIR", default_value = "demo")]
+    pub out: PathBuf,
+    /// Seed of speckle and noise
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Stage move in mm: right, down, towards the camera
+    #[arg(long, value_name = "X,Y,Z", default_value = "0.050,-0.030,0.200", value_parser = parse_move, allow_hyphen_values = true)]
+    pub r#move: Move,
+    /// Pitch that the host believes, relative to the rig's true one (for trying out what a wrong one does)
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
+    pub pitch_factor: f64,
+    /// Do not calibrate; decode with the experiment's values as they stand
+    #[arg(long)]
+    pub no_calibration: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct SimulateArgs {
+    /// Experiment file (see `daic init`)
+    pub experiment: PathBuf,
+    /// Folder for the dataset
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Scene file of the simulated rig (see `hil-sim --print-scene`); default: the experiment's optics and a cylinder
+    #[arg(long, value_name = "FILE")]
+    pub scene: Option<PathBuf>,
+    /// Seed of speckle and noise (default: the experiment's)
+    #[arg(long)]
+    pub seed: Option<u64>,
+}
+
+#[derive(Debug, Args)]
+pub struct RunArgs {
+    /// Experiment file (see `daic init`)
+    pub experiment: PathBuf,
+    /// Folder for the dataset
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Serial port or tcp://HOST:PORT of the trigger box (default: the experiment's)
+    #[arg(long)]
+    pub port: Option<String>,
+    /// Folder into which the camera's program (or `hil-sim --frames`) writes its frames
+    #[arg(long, value_name = "DIR")]
+    pub frames: PathBuf,
+}
+
+#[derive(Debug, Args)]
+pub struct ProcessArgs {
+    /// Dataset folder
+    pub dataset: PathBuf,
+    /// Measure anew what has been measured already
+    #[arg(long)]
+    pub fresh: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct CorrelateArgs {
+    /// Reference image (8 or 16 bit TIFF, PNG, BMP)
+    pub reference: PathBuf,
+    /// Deformed image
+    pub deformed: PathBuf,
+    #[command(flatten)]
+    pub dic: DicArgs,
+    /// Region of interest in pixels: X,Y,WIDTH,HEIGHT
+    #[arg(long, value_name = "X,Y,W,H", value_parser = parse_roi, allow_hyphen_values = true)]
+    pub roi: Option<Roi>,
+    /// Points to this file (.csv or .npz)
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+}
+
+/// Subset settings; what is not given comes from the optics or experiment file, or the default.
+#[derive(Debug, Args)]
+pub struct DicArgs {
+    /// Subset side in pixels, odd
+    #[arg(long, value_name = "PX")]
+    pub subset: Option<u32>,
+    /// Distance of points in pixels
+    #[arg(long, value_name = "PX")]
+    pub step: Option<u32>,
+    /// Shape function
+    #[arg(long)]
+    pub shape: Option<ShapeArg>,
+    /// Interpolating B-spline
+    #[arg(long)]
+    pub interpolation: Option<InterpolationArg>,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum ShapeArg {
+    Affine,
+    Quadratic,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum InterpolationArg {
+    Cubic,
+    Quintic,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum DecoderArg {
+    /// Exact rays through the grating equation
+    Ray,
+    /// Virtual object, not linearised
+    Closed,
+    /// Virtual object, linearised (the literature)
+    Linear,
+}
+
+#[derive(Debug, Args)]
+pub struct ProfileArgs {
+    /// Optics file (examples/golden-macro.toml)
+    #[arg(long, value_name = "FILE")]
+    pub optics: PathBuf,
+    /// Frame with both first-order views
+    pub frame: PathBuf,
+    /// How pixel pairs become points
+    #[arg(long, default_value = "ray")]
+    pub decoder: DecoderArg,
+    #[command(flatten)]
+    pub dic: DicArgs,
+    /// Folder for points, maps and the report
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+}
+
+#[derive(Debug, Args)]
+pub struct DisplacementArgs {
+    /// Optics file (examples/golden-macro.toml)
+    #[arg(long, value_name = "FILE")]
+    pub optics: PathBuf,
+    /// Reference frame with both first-order views
+    pub reference: PathBuf,
+    /// Deformed frame
+    pub deformed: PathBuf,
+    /// How pixel pairs become points
+    #[arg(long, default_value = "ray")]
+    pub decoder: DecoderArg,
+    #[command(flatten)]
+    pub dic: DicArgs,
+    /// Folder for points, maps and the report
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+}
+
+#[derive(Debug, Args)]
+pub struct InitArgs {
+    /// File to write
+    #[arg(default_value = "experiment.toml")]
+    pub file: PathBuf,
+    /// Overwrite an existing file
+    #[arg(long)]
+    pub force: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct DoctorArgs {
+    /// Also ask the box at this port who it is
+    #[arg(long)]
+    pub port: Option<String>,
+}
+
+/// Three stage coordinates in mm.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Move(pub [f64; 3]);
+
+/// Rectangle in pixels: x, y, width, height.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Roi(pub [i64; 4]);
+
+fn numbers<T: std::str::FromStr, const N: usize>(text: &str, form: &str) -> Result<[T; N], String> {
+    let parsed: Option<Vec<T>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
+    parsed
+        .and_then(|values| <[T; N]>::try_from(values).ok())
+        .ok_or_else(|| format!("found `{text}`, wanted {N} numbers {form}"))
+}
+
+fn parse_move(text: &str) -> Result<Move, String> {
+    let values = numbers::<f64, 3>(text, "X,Y,Z in mm, for example 0.050,-0.030,0.200")?;
+    // the demo's scene keeps both views on the sensor and the specimen in range within these
+    const LIMIT_MM: [f64; 3] = [0.5, 0.5, 2.0];
+    for ((value, limit), axis) in values.iter().zip(LIMIT_MM).zip(["X", "Y", "Z"]) {
+        if !(value.abs() <= limit) {
+            return Err(format!("{axis} is {value} mm; allowed are -{limit} to {limit} mm"));
+        }
+    }
+    Ok(Move(values))
+}
+
+fn parse_roi(text: &str) -> Result<Roi, String> {
+    numbers(text, "X,Y,WIDTH,HEIGHT in pixels").map(Roi)
+}

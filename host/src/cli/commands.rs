@@ -1,0 +1,277 @@
+//! What each command does: arguments to facade calls, results to an answer.
+
+use super::arguments::{
+    CorrelateArgs, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, InitArgs, InterpolationArg, ProcessArgs,
+    ProfileArgs, Roi, RunArgs, ShapeArg,
+};
+#[cfg(feature = "sim")]
+use super::arguments::{DemoArgs, SimulateArgs};
+use super::output::{Answer, Output};
+use daic::measure::{self, Rectangle, Reference};
+use daic::{Error, doctor as checks, images, optics_section, pair, process as processing, reports};
+use daic_dataset::{GreyImage, atomic};
+use daic_optics::{Decoder, OpticalModel};
+use daic_rig::experiment::{self, Experiment, OpticsFile};
+use serde_json::json;
+use std::fmt::Write as _;
+use std::path::Path;
+
+#[cfg(feature = "sim")]
+pub fn demo(arguments: &DemoArgs, output: &Output) -> Result<Answer, Error> {
+    let options = daic::demo::Options {
+        out: arguments.out.clone(),
+        seed: arguments.seed,
+        move_mm: arguments.r#move.0,
+        pitch_factor: arguments.pitch_factor,
+        calibrate: !arguments.no_calibration,
+    };
+    let summary = daic::demo::run(&options, output)?;
+    let mut text = String::new();
+    let m = &summary.measurement;
+    let rows = [m.commanded_um, m.measured_um, m.rms_um, m.sigma_um];
+    let [commanded, measured, rms, sigma] = rows.map(|r| r.unwrap_or([f64::NAN; 3]));
+    writeln!(text, "{:<8}{:>14}{:>14}{:>16}{:>14}", "µm", "commanded", "measured", "difference RMS", "σ of a point").ok();
+    for (i, axis) in ["x", "y", "h"].into_iter().enumerate() {
+        let values = format!("{:>14.3}{:>14.3}{:>16.3}{:>14.3}", commanded[i], measured[i], rms[i], sigma[i]);
+        writeln!(text, "{axis:<8}{values}").ok();
+    }
+    for check in &summary.checks {
+        let mark = if check.passed { "ok  " } else { "FAIL" };
+        writeln!(text, "{mark}  {}: {} (limit {})", check.name, check.found, check.limit).ok();
+    }
+    writeln!(text, "report: {}", arguments.out.join("report.html").display()).ok();
+    let passed = summary.passed;
+    Ok(Answer::new(as_json(&summary)?, text).checked(passed))
+}
+
+#[cfg(feature = "sim")]
+pub fn simulate(arguments: &SimulateArgs, output: &Output) -> Result<Answer, Error> {
+    let mut experiment = Experiment::load(&arguments.experiment)?;
+    if let Some(seed) = arguments.seed {
+        experiment.seed = seed;
+    }
+    let recorded = daic::demo::simulate(&experiment, arguments.scene.as_deref(), &arguments.out, output)?;
+    recording_answer(&arguments.out, &recorded)
+}
+
+pub fn run(arguments: &RunArgs, output: &Output) -> Result<Answer, Error> {
+    let experiment = Experiment::load(&arguments.experiment)?;
+    let port = arguments.port.clone().unwrap_or_else(|| experiment.rig.port.clone());
+    let recorded = daic::recording::run_at_port(&experiment, &port, &arguments.frames, &arguments.out, output)?;
+    recording_answer(&arguments.out, &recorded)
+}
+
+fn recording_answer(out: &Path, recorded: &processing::FrameCounts) -> Result<Answer, Error> {
+    let json = json!({ "dataset": out.display().to_string(), "frames": as_json(recorded)? });
+    let text = format!(
+        "{}: {} frames paired, {} missing, {} extra, {} ambiguous\nnext: daic process {}",
+        out.display(),
+        recorded.paired,
+        recorded.missing,
+        recorded.extra,
+        recorded.ambiguous,
+        out.display()
+    );
+    Ok(Answer::new(json, text))
+}
+
+pub fn process(arguments: &ProcessArgs, output: &Output) -> Result<Answer, Error> {
+    let processed = processing::process(&arguments.dataset, arguments.fresh, output)?;
+    let mut text = String::new();
+    for damage in &processed.damage {
+        eprintln!("note: {damage}");
+    }
+    for frame in &processed.summary.measured {
+        let [u, v, w] = frame.field.measured_um;
+        let (name, ok, all) = (&frame.name, frame.field.ok, frame.field.points);
+        writeln!(text, "{name}: u {u:.3} µm, v {v:.3} µm, w {w:.3} µm ({ok} of {all} points)").ok();
+    }
+    let report = arguments.dataset.join("report.html");
+    writeln!(text, "{} results were there already; report: {}", processed.resumed, report.display()).ok();
+    Ok(Answer::new(as_json(&processed.summary)?, text))
+}
+
+pub fn correlate(arguments: &CorrelateArgs, output: &Output) -> Result<Answer, Error> {
+    let (reference, deformed) = images::read_pair(&arguments.reference, &arguments.deformed)?;
+    let roi = arguments.roi.map(|roi| rectangle(roi, &reference)).transpose()?;
+    let writer = arguments.out.as_deref().map(table_writer).transpose()?;
+    let mut dic = daic_correlate::Settings::default();
+    let mut step = 5;
+    apply(&arguments.dic, &mut dic, &mut step);
+    let found = pair::correlate(&reference, &deformed, &dic, step, roi, output)?;
+    let table = found.table()?;
+    if let (Some(path), Some(write)) = (&arguments.out, writer) {
+        write(&table, path)?;
+    }
+    let seconds = |s: fn(&daic::usage::Seconds) -> f64| {
+        json!({ "init": s(&found.init), "prepare": s(&found.prepare), "solve": s(&found.solve), "total": s(&found.total) })
+    };
+    let json = json!({
+        "points": found.points.len(),
+        "converged": found.converged(),
+        "cpu_s": seconds(|s| s.cpu),
+        "wall_s": seconds(|s| s.wall),
+        "peak_rss_mb": daic::usage::peak_rss_mb(),
+        "settings": as_json(&dic)?,
+        "step": step,
+        "out": arguments.out.as_ref().map(|p| p.display().to_string()),
+    });
+    let ok = || found.points.iter().filter(|p| p.status.is_ok());
+    let (u, v) = (measure::spread(ok().map(|p| p.u)), measure::spread(ok().map(|p| p.v)));
+    let text = format!(
+        "{} of {} points converged in {:.2} s\nu {:.4} ± {:.4} px, v {:.4} ± {:.4} px (mean and scatter over the points)",
+        found.converged(),
+        found.points.len(),
+        found.total.wall,
+        u.mean,
+        u.std,
+        v.mean,
+        v.std
+    );
+    Ok(Answer::new(json, text))
+}
+
+type TableWriter = fn(&daic_dataset::Table, &Path) -> Result<(), daic_dataset::TableError>;
+
+/// How a table is written, decided before the work begins.
+fn table_writer(path: &Path) -> Result<TableWriter, Error> {
+    match path.extension().and_then(|e| e.to_str()) {
+        Some("csv") => Ok(daic_dataset::Table::write_csv),
+        Some("npz") => Ok(daic_dataset::Table::write_npz),
+        _ => Err(Error::UnknownFormat { path: path.to_owned(), allowed: ".csv, .npz" }),
+    }
+}
+
+fn rectangle(roi: Roi, image: &GreyImage) -> Result<Rectangle, Error> {
+    let [x, y, w, h] = roi.0;
+    let (width, height) = (image.width, image.height);
+    let outside = Error::RoiOutside { x, y, w, h, width, height };
+    let fits = |start: i64, length: i64, size: u32| {
+        start >= 0 && length > 0 && start.checked_add(length).is_some_and(|end| end <= i64::from(size))
+    };
+    if !fits(x, w, width) || !fits(y, h, height) {
+        return Err(outside);
+    }
+    let [x, y, width, height] = roi.0.map(|v| v as usize);
+    Ok(Rectangle { x, y, width, height })
+}
+
+fn apply(arguments: &DicArgs, settings: &mut daic_correlate::Settings, step: &mut usize) {
+    if let Some(subset) = arguments.subset {
+        settings.subset = subset as usize;
+    }
+    if let Some(given) = arguments.step {
+        *step = given as usize;
+    }
+    match arguments.shape {
+        Some(ShapeArg::Affine) => settings.shape = daic_correlate::Shape::Affine,
+        Some(ShapeArg::Quadratic) => settings.shape = daic_correlate::Shape::Quadratic,
+        None => {}
+    }
+    match arguments.interpolation {
+        Some(InterpolationArg::Cubic) => settings.interpolation = daic_correlate::Interpolation::Cubic,
+        Some(InterpolationArg::Quintic) => settings.interpolation = daic_correlate::Interpolation::Quintic,
+        None => {}
+    }
+}
+
+fn decoder(decoder: DecoderArg) -> Decoder {
+    match decoder {
+        DecoderArg::Ray => Decoder::Ray,
+        DecoderArg::Closed => Decoder::Closed,
+        DecoderArg::Linear => Decoder::Linear,
+    }
+}
+
+fn measure_settings(arguments: &DicArgs) -> measure::Settings {
+    let mut settings = measure::Settings::default();
+    apply(arguments, &mut settings.dic, &mut settings.step);
+    settings
+}
+
+fn model(path: &Path) -> Result<OpticalModel, Error> {
+    Ok(OpticalModel::new(&optics_section::from_section(&OpticsFile::load(path)?.optics)?)?)
+}
+
+fn make_folder(path: &Path) -> Result<(), Error> {
+    std::fs::create_dir_all(path).map_err(|source| Error::Folder { path: path.to_owned(), source })
+}
+
+pub fn profile(arguments: &ProfileArgs, output: &Output) -> Result<Answer, Error> {
+    let model = model(&arguments.optics)?;
+    let frame = images::read(&arguments.frame)?;
+    let settings = measure_settings(&arguments.dic);
+    let reference = Reference::new(&frame, &model, &settings, output)?;
+    let decoder = decoder(arguments.decoder);
+    let profile = measure::profile(&reference.grid, &reference.matches, &model, decoder);
+    make_folder(&arguments.out)?;
+    measure::write_profile(&arguments.out, &profile)?;
+    let linear = measure::profile(&reference.grid, &reference.matches, &model, Decoder::Linear);
+    let page = reports::profile_page(&frame, &reference, &profile, &linear, decoder, &settings)?;
+    atomic::write_bytes(&arguments.out.join("report.html"), page.as_bytes())?;
+    let summary = processing::profile_summary(&profile);
+    let text = format!(
+        "{} of {} points, mean height {:.4} mm, σ of a height {:.2} µm, mean gap {:.2} µm\nreport: {}",
+        summary.ok,
+        summary.points,
+        summary.mean_h_mm,
+        summary.sigma_h_um,
+        summary.mean_gap_um,
+        arguments.out.join("report.html").display()
+    );
+    Ok(Answer::new(as_json(&summary)?, text))
+}
+
+pub fn displacement(arguments: &DisplacementArgs, output: &Output) -> Result<Answer, Error> {
+    let model = model(&arguments.optics)?;
+    let (frame, deformed) = images::read_pair(&arguments.reference, &arguments.deformed)?;
+    let settings = measure_settings(&arguments.dic);
+    let reference = Reference::new(&frame, &model, &settings, output)?;
+    let tracks = reference.track(&deformed, output)?;
+    let decoder = decoder(arguments.decoder);
+    let field = measure::displacement(&reference.grid, &reference.matches, &tracks, &model, decoder);
+    make_folder(&arguments.out)?;
+    measure::write_displacement(&arguments.out, &field)?;
+    let page = reports::displacement_page(&frame, &reference, &field, decoder, &settings)?;
+    atomic::write_bytes(&arguments.out.join("report.html"), page.as_bytes())?;
+    let summary = processing::field_summary(&field);
+    let [u, v, w] = summary.measured_um;
+    let [su, sv, sw] = summary.std_um;
+    let text = format!(
+        "{} of {} points: u {u:.3} µm (scatter {su:.3}), v {v:.3} µm ({sv:.3}), w {w:.3} µm ({sw:.3})\nreport: {}",
+        summary.ok,
+        summary.points,
+        arguments.out.join("report.html").display()
+    );
+    Ok(Answer::new(as_json(&summary)?, text))
+}
+
+pub fn init(arguments: &InitArgs) -> Result<Answer, Error> {
+    let path = &arguments.file;
+    if path.exists() && !arguments.force {
+        return Err(Error::Exists { path: path.clone() });
+    }
+    atomic::write_bytes(path, experiment::template().as_bytes())?;
+    let text = format!("wrote {0}\nnext: daic simulate {0} --out dataset", path.display());
+    Ok(Answer::new(json!({ "file": path.display().to_string() }), text))
+}
+
+pub fn schema() -> Result<Answer, Error> {
+    let text = experiment::experiment_schema();
+    let json = serde_json::from_str(&text).map_err(|source| Error::Unwritable {
+        path: "the schema".into(),
+        reason: source.to_string(),
+    })?;
+    Ok(Answer::new(json, text))
+}
+
+pub fn doctor(arguments: &DoctorArgs) -> Result<Answer, Error> {
+    let found = checks::look(arguments.port.as_deref())?;
+    let text = found.to_string();
+    Ok(Answer::new(as_json(&found)?, text))
+}
+
+fn as_json(value: &impl serde::Serialize) -> Result<serde_json::Value, Error> {
+    serde_json::to_value(value)
+        .map_err(|source| Error::Unwritable { path: "the answer".into(), reason: source.to_string() })
+}

@@ -1,0 +1,59 @@
+//! Flags, progress and the shape of answers.
+
+mod arguments;
+mod commands;
+mod output;
+
+use arguments::{Cli, Command};
+use clap::Parser as _;
+use daic::Error;
+use output::Output;
+use std::process::ExitCode;
+
+/// Parses the arguments, runs the command, prints its one answer.
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let output = Output::new(cli.json, cli.quiet);
+    output.install_error_style();
+    match with_threads(cli.threads, || run(&cli.command, &output)) {
+        Ok(answer) => {
+            let code = answer.exit_code();
+            output.answer(&answer);
+            ExitCode::from(code)
+        }
+        Err(error) => {
+            output.error(&error);
+            ExitCode::from(error.exit_code())
+        }
+    }
+}
+
+fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
+    match command {
+        #[cfg(feature = "sim")]
+        Command::Demo(arguments) => commands::demo(arguments, output),
+        #[cfg(feature = "sim")]
+        Command::Simulate(arguments) => commands::simulate(arguments, output),
+        Command::Run(arguments) => commands::run(arguments, output),
+        Command::Process(arguments) => commands::process(arguments, output),
+        Command::Correlate(arguments) => commands::correlate(arguments, output),
+        Command::Profile(arguments) => commands::profile(arguments, output),
+        Command::Displacement(arguments) => commands::displacement(arguments, output),
+        Command::Init(arguments) => commands::init(arguments),
+        Command::Schema => commands::schema(),
+        Command::Doctor(arguments) => commands::doctor(arguments),
+    }
+}
+
+/// Runs `work` in a pool of `threads` threads (all cores by default). Results do not depend on it.
+fn with_threads<T: Send>(
+    threads: Option<std::num::NonZeroUsize>,
+    work: impl FnOnce() -> Result<T, Error> + Send,
+) -> Result<T, Error> {
+    let Some(threads) = threads else { return work() };
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads.get())
+        .build()
+        .map_err(|error| Error::Threads { threads: threads.get(), reason: error.to_string() })?;
+    pool.install(work)
+}

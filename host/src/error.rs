@@ -1,0 +1,200 @@
+//! What can go wrong, and the way out.
+
+use std::path::PathBuf;
+
+/// Every error of the facade and the program.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// An experiment or optics file.
+    #[error(transparent)]
+    Config(#[from] daic_rig::experiment::ConfigError),
+    /// Optics that no set-up can have.
+    #[error("the optics cannot be used: {0}")]
+    Optics(#[from] daic_optics::OpticsError),
+    /// Neither one grating nor one for each view.
+    #[error("the optics state no complete grating: give `grating`, or both `grating_minus` and `grating_plus`")]
+    Gratings,
+    /// An image file.
+    #[error(transparent)]
+    Image(#[from] daic_dataset::ImageFileError),
+    /// Two images of one pair differ in size.
+    #[error("{} has {found_width}×{found_height} pixels, {} has {width}×{height}: both must have the same size", path.display(), other.display())]
+    SizesDiffer {
+        /// The second image.
+        path: PathBuf,
+        /// The first image.
+        other: PathBuf,
+        /// Of the second.
+        found_width: u32,
+        /// Of the second.
+        found_height: u32,
+        /// Of the first.
+        width: u32,
+        /// Of the first.
+        height: u32,
+    },
+    /// A region of interest that the image does not hold.
+    #[error("the region of interest {x},{y},{w},{h} does not lie inside the image of {width}×{height} pixels: x + w must be at most {width}, y + h at most {height}")]
+    RoiOutside {
+        /// Left.
+        x: i64,
+        /// Top.
+        y: i64,
+        /// Width.
+        w: i64,
+        /// Height.
+        h: i64,
+        /// Of the image.
+        width: u32,
+        /// Of the image.
+        height: u32,
+    },
+    /// An image without contrast.
+    #[error("{} is blank: every pixel has grey level {level}; there is nothing to correlate", path.display())]
+    Blank {
+        /// The image.
+        path: PathBuf,
+        /// Its one grey level.
+        level: u16,
+    },
+    /// A file name whose ending says no known format.
+    #[error("{} ends in no format that can be written here: use one of {allowed}", path.display())]
+    UnknownFormat {
+        /// The file.
+        path: PathBuf,
+        /// Endings that can be used.
+        allowed: &'static str,
+    },
+    /// A file that is there already.
+    #[error("{} exists already; choose another name, or overwrite it with --force", path.display())]
+    Exists {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A dataset folder.
+    #[error(transparent)]
+    Dataset(#[from] daic_dataset::DatasetError),
+    /// A table.
+    #[error(transparent)]
+    Table(#[from] daic_dataset::TableError),
+    /// A map.
+    #[error(transparent)]
+    Map(#[from] daic_dataset::MapError),
+    /// A file that could not be written.
+    #[error(transparent)]
+    Write(#[from] daic_dataset::WriteError),
+    /// A folder that could not be made.
+    #[error("cannot make folder {}: {source}", path.display())]
+    Folder {
+        /// The folder.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// An image that the correlation cannot take.
+    #[error("the image cannot be correlated: {0}")]
+    Grey(#[from] daic_correlate::ImageError),
+    /// A correlation setting.
+    #[error("the correlation cannot run: {0}")]
+    Settings(#[from] daic_correlate::SettingsError),
+    /// The points of interest.
+    #[error("no points can be laid out: {0}; choose a smaller subset or a larger region")]
+    Points(#[from] daic_correlate::PointsError),
+    /// The correlation.
+    #[error(transparent)]
+    Correlate(#[from] daic_correlate::CorrelateError),
+    /// The two views.
+    #[error("the two first-order views were not found: {0}")]
+    Views(#[from] daic_correlate::ViewsError),
+    /// A ray that the optics do not have.
+    #[error("the optics do not reach the frame: {0}; check distances, pitch and wavelength")]
+    Trace(#[from] daic_optics::TraceError),
+    /// The calibration.
+    #[error("the calibration failed: {0}")]
+    Calibrate(#[from] daic_optics::calibrate::CalibrateError),
+    /// No surface where the datum of heights is.
+    #[error("the calibration needs the surface near the optical axis for its height datum: {found} points lie within {radius_mm} mm of it, {needed} are needed; move the specimen or the principal point")]
+    NoAxisPoints {
+        /// Points there.
+        found: usize,
+        /// Points needed.
+        needed: usize,
+        /// How near.
+        radius_mm: f64,
+    },
+    /// A dataset in which nothing can be measured.
+    #[error("none of the {frames} frames of {} is paired with its strobe: there is nothing to measure; see frames.jsonl", root.display())]
+    NoPairedFrame {
+        /// The dataset.
+        root: PathBuf,
+        /// Frames in it.
+        frames: usize,
+    },
+    /// A stored program that cannot be expanded.
+    #[error("the dataset's program cannot be expanded: {0}")]
+    Expand(#[from] crate::expand::ExpandError),
+    /// The rig.
+    #[error(transparent)]
+    Rig(#[from] daic_rig::RigError),
+    /// The simulated rig.
+    #[cfg(feature = "sim")]
+    #[error(transparent)]
+    Sim(#[from] daic_hil_sim::SimError),
+    /// A scene of the simulated rig.
+    #[cfg(feature = "sim")]
+    #[error(transparent)]
+    Scene(#[from] daic_hil_sim::ConfigError),
+    /// The frames of a simulated rig were asked for twice.
+    #[error("the frames of the simulated rig have been taken already")]
+    FramesTaken,
+    /// A figure.
+    #[error("a figure cannot be drawn: {0}")]
+    Report(#[from] daic_report::ReportError),
+    /// A file that could not be read.
+    #[error("cannot read {}: {source}; check the path and its permissions", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// Something that has no form as a file.
+    #[error("cannot write {}: {reason}", path.display())]
+    Unwritable {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        reason: String,
+    },
+    /// Threads that the system does not give.
+    #[error("cannot start {threads} threads: {reason}")]
+    Threads {
+        /// How many.
+        threads: usize,
+        /// Why.
+        reason: String,
+    },
+}
+
+impl Error {
+    /// Exit code of the program: 2 for input, 3 for the rig.
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Self::Rig(error) if !error.is_input() => 3,
+            #[cfg(feature = "sim")]
+            Self::Sim(daic_hil_sim::SimError::Config(_)) => 2,
+            #[cfg(feature = "sim")]
+            Self::Sim(_) | Self::FramesTaken => 3,
+            _ => 2,
+        }
+    }
+
+    /// The experiment or optics file that is to blame, with the places in it.
+    pub fn config(&self) -> Option<&daic_rig::experiment::ConfigError> {
+        match self {
+            Self::Config(error) | Self::Rig(daic_rig::RigError::Config(error)) => Some(error),
+            _ => None,
+        }
+    }
+}

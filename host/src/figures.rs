@@ -1,0 +1,110 @@
+//! Figures of results.
+
+use crate::error::Error;
+use crate::measure::Rectangle;
+use daic_dataset::{FloatMap, GreyImage, atomic};
+use daic_report::{ColourScale, Figure, GridAxes, HeightSurface, Heatmap, Mark, Overlay};
+use std::path::Path;
+
+fn axes(map: &FloatMap) -> GridAxes {
+    let a = &map.axes;
+    GridAxes { x0: a.x0, dx: a.dx, y0: a.y0, dy: a.dy, unit: a.unit.clone() }
+}
+
+fn heatmap(map: &FloatMap, title: &str, quantity: &str, unit: &str, factor: f64) -> Heatmap {
+    let values: Vec<f64> = map.data.iter().map(|v| v * factor).collect();
+    let scale = ColourScale::values(&values);
+    Heatmap {
+        title: title.to_owned(),
+        width: map.width as usize,
+        height: map.height as usize,
+        values,
+        axes: axes(map),
+        quantity: quantity.to_owned(),
+        unit: unit.to_owned(),
+        scale,
+    }
+}
+
+/// Writes the bare map as a picture, a square per node, transparent where there is no value.
+///
+/// # Errors
+/// The file that could not be written.
+pub fn write_map_png(path: &Path, map: &FloatMap) -> Result<(), Error> {
+    let png = heatmap(map, &map.name, &map.name, &map.unit, 1.0).render_png()?;
+    Ok(atomic::write_bytes(path, &png)?)
+}
+
+/// A map of millimetres, drawn in micrometres or millimetres, with axes and colour bar.
+///
+/// # Errors
+/// If the figure cannot be drawn.
+pub fn map_figure(
+    map: &FloatMap,
+    title: &str,
+    quantity: &str,
+    unit: Unit,
+    caption: &str,
+) -> Result<Figure, Error> {
+    let (name, factor) = match unit {
+        Unit::Micrometre => ("µm", 1e3),
+        Unit::Millimetre => ("mm", 1.0),
+    };
+    Ok(Figure {
+        id: map.name.clone(),
+        title: title.to_owned(),
+        caption: caption.to_owned(),
+        body: heatmap(map, title, quantity, name, factor).render_svg()?,
+    })
+}
+
+/// Unit in which a map of millimetres is drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unit {
+    /// Values times 1000.
+    Micrometre,
+    /// Values as they are.
+    Millimetre,
+}
+
+/// The surface, to be turned with the mouse.
+///
+/// # Errors
+/// If the figure cannot be drawn.
+pub fn surface_figure(height: &FloatMap, title: &str, caption: &str) -> Result<Figure, Error> {
+    let surface = HeightSurface {
+        title: title.to_owned(),
+        width: height.width as usize,
+        height: height.height as usize,
+        values: height.data.clone(),
+        axes: axes(height),
+        quantity: "h".to_owned(),
+        unit: "mm".to_owned(),
+        scale: ColourScale::values(&height.data),
+    };
+    Ok(Figure {
+        id: "surface".to_owned(),
+        title: title.to_owned(),
+        caption: caption.to_owned(),
+        body: surface.render_html()?,
+    })
+}
+
+/// The frame with the two views as they were found.
+///
+/// # Errors
+/// If the figure cannot be drawn.
+pub fn views_overlay(frame: &GreyImage, minus: Rectangle, plus: Rectangle, title: &str) -> Overlay {
+    let mark = |r: Rectangle, label: &str, colour| {
+        Mark::rectangle(r.x as f64, r.y as f64, r.width as f64, r.height as f64, label, colour)
+    };
+    Overlay {
+        title: title.to_owned(),
+        width: frame.width as usize,
+        height: frame.height as usize,
+        grey: frame.data.clone(),
+        display: None,
+        marks: vec![mark(minus, "−1 view", 0), mark(plus, "+1 view", 1)],
+        most_pixels: 900,
+    }
+}

@@ -1,0 +1,263 @@
+//! Finding the two views, matching one with the other, following both into another frame.
+
+use super::{Grid, PointStatus};
+use crate::error::Error;
+use crate::progress::Progress;
+use daic_correlate::{
+    Correlation, Guess, Image, Observer, Point, Points, Reference as Subsets, Roi, Stage, Target, find_views,
+};
+use daic_dataset::GreyImage;
+use daic_optics::{OpticalModel, PixelPair};
+
+pub use daic_correlate::Rectangle;
+
+/// How frames are matched.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settings {
+    /// Subset, shape function, interpolation and acceptance.
+    pub dic: daic_correlate::Settings,
+    /// Distance of points in pixels.
+    pub step: usize,
+    /// Heights between which the surface is searched, millimetres.
+    pub height_mm: [f64; 2],
+    /// Where the centres of subsets may lie in the −1 view; `None` takes the view found.
+    pub roi: Option<Rectangle>,
+}
+
+impl Default for Settings {
+    /// Subsets large enough for a second-order shape function at little noise: curved surfaces are
+    /// matched without the bias L²/24·u'' of a first-order one.
+    fn default() -> Self {
+        Self {
+            dic: daic_correlate::Settings {
+                subset: 59,
+                shape: daic_correlate::Shape::Quadratic,
+                ..daic_correlate::Settings::default()
+            },
+            step: 5,
+            height_mm: [-12.0, 12.0],
+            roi: None,
+        }
+    }
+}
+
+/// Beyond the v that the optics expect, this much is searched: gratings rotated by 10 mrad.
+const V_MARGIN_PX: f64 = 10.0;
+/// Beyond the u that the heights allow: distances that are 1 % wrong.
+const U_MARGIN: f64 = 0.01;
+
+/// A point seen in both views of one frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Match {
+    /// Where; the +1 pixel is NaN where the match failed.
+    pub pair: PixelPair,
+    /// Standard deviations (x, y) of the +1 pixel relative to the −1 pixel, pixels.
+    pub sigma_px: [f64; 2],
+    /// Whether the match holds.
+    pub status: PointStatus,
+}
+
+/// A matched point in another frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Track {
+    /// Where the −1 view sees it.
+    pub minus_px: [f64; 2],
+    /// Where the +1 view sees it.
+    pub plus_px: [f64; 2],
+    /// Standard deviations of its move in the −1 view, pixels.
+    pub sigma_minus_px: [f64; 2],
+    /// Standard deviations of its move in the +1 view, pixels.
+    pub sigma_plus_px: [f64; 2],
+    /// Whether both moves hold.
+    pub status: PointStatus,
+}
+
+/// All matched points in another frame, in their order.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Tracks {
+    /// One entry per point of the reference.
+    pub points: Vec<Track>,
+}
+
+/// A frame whose views are found and matched.
+pub struct Reference {
+    subsets: Subsets,
+    points: Points,
+    settings: Settings,
+    /// The −1 view found.
+    pub minus: Rectangle,
+    /// The +1 view found.
+    pub plus: Rectangle,
+    /// Where the points stand.
+    pub grid: Grid,
+    /// The points, in the order of the grid.
+    pub matches: Vec<Match>,
+}
+
+/// Hands the correlation's progress on under a name.
+struct Named<'a>(&'static str, &'a dyn Progress);
+
+impl Observer for Named<'_> {
+    fn stage(&self, stage: Stage) {
+        if stage == Stage::Init {
+            self.1.stage(self.0, 0);
+        }
+    }
+    fn points(&self, done: usize, total: usize) {
+        if done == 0 {
+            self.1.stage(self.0, total as u64);
+        }
+        self.1.advance(done as u64);
+    }
+}
+
+/// Grey levels as the correlation wants them.
+///
+/// # Errors
+/// If the image has no pixels or is too large.
+pub fn image_of(frame: &GreyImage) -> Result<Image, Error> {
+    Ok(Image::from_u16(frame.width as usize, frame.height as usize, &frame.data)?)
+}
+
+fn displaced(point: &Point) -> [f64; 2] {
+    [point.x + point.u, point.y + point.v]
+}
+
+fn sigma(point: &Point) -> [f64; 2] {
+    [f64::from(point.sigma_u), f64::from(point.sigma_v)]
+}
+
+fn grid_of(points: &Points) -> Grid {
+    let Some(grid) = points.as_grid() else {
+        return Grid::none();
+    };
+    let nodes = (0..grid.rows).flat_map(|j| (0..grid.columns).map(move |i| (i, j)));
+    Grid {
+        x0: grid.x0,
+        y0: grid.y0,
+        step: grid.step,
+        columns: grid.columns,
+        rows: grid.rows,
+        nodes: nodes.map(|(i, j)| grid.point(i, j)).collect(),
+    }
+}
+
+impl Reference {
+    /// Finds the two views of `frame` and matches them along the diffraction direction.
+    ///
+    /// # Errors
+    /// If there are not two views, a setting cannot be used, or no subset fits.
+    pub fn new(
+        frame: &GreyImage,
+        model: &OpticalModel,
+        settings: &Settings,
+        progress: &dyn Progress,
+    ) -> Result<Self, Error> {
+        let image = image_of(frame)?;
+        settings.dic.validate_for(image.width(), image.height())?;
+        progress.stage("finding the two views", 0);
+        let found = find_views(&image)?;
+        let roi = Roi { rectangle: settings.roi, mask: Some(&found.minus.mask) };
+        let points =
+            Points::grid(image.width(), image.height(), settings.dic.subset, settings.step, &roi)?;
+        let (u, v) = disparity(model, &found.minus.bounds, settings.height_mm)?;
+        let target = Target::new(image.clone(), settings.dic.interpolation);
+        let subsets = Subsets::new(image);
+        let matched = daic_correlate::correlate(
+            &subsets,
+            &target,
+            &points,
+            &Guess::Search { u, v },
+            &settings.dic,
+            &Named("matching the two views", progress),
+        )?;
+        let matches = matched.points.iter().map(match_of).collect();
+        Ok(Self {
+            subsets,
+            grid: grid_of(&points),
+            points,
+            settings: settings.clone(),
+            minus: found.minus.bounds,
+            plus: found.plus.bounds,
+            matches,
+        })
+    }
+
+    /// Follows the matched points of both views into `frame`.
+    ///
+    /// The +1 points lie between pixels; they are correlated where they are, not interpolated from a
+    /// grid.
+    ///
+    /// # Errors
+    /// If the frame has another size.
+    pub fn track(&self, frame: &GreyImage, progress: &dyn Progress) -> Result<Tracks, Error> {
+        let target = Target::new(image_of(frame)?, self.settings.dic.interpolation);
+        let run = |points: &Points, name| -> Result<Correlation, Error> {
+            let observer = Named(name, progress);
+            Ok(daic_correlate::correlate(&self.subsets, &target, points, &Guess::Fft, &self.settings.dic, &observer)?)
+        };
+        let minus = run(&self.points, "tracking in the −1 view")?;
+        let matched: Vec<usize> =
+            (0..self.matches.len()).filter(|&k| self.matches[k].status.is_ok()).collect();
+        let positions = matched.iter().map(|&k| self.matches[k].pair.plus_px).collect();
+        let plus = run(&Points::scattered(positions)?, "tracking in the +1 view")?;
+
+        let mut points: Vec<Track> = self
+            .matches
+            .iter()
+            .zip(&minus.points)
+            .map(|(m, p)| Track {
+                minus_px: displaced(p),
+                plus_px: [f64::NAN; 2],
+                sigma_minus_px: sigma(p),
+                sigma_plus_px: [f64::NAN; 2],
+                status: if !m.status.is_ok() {
+                    m.status
+                } else if p.status.is_ok() {
+                    PointStatus::Ok
+                } else {
+                    PointStatus::TrackMinus(p.status.name())
+                },
+            })
+            .collect();
+        for (&k, p) in matched.iter().zip(&plus.points) {
+            let track = &mut points[k];
+            track.plus_px = displaced(p);
+            track.sigma_plus_px = sigma(p);
+            if track.status.is_ok() && !p.status.is_ok() {
+                track.status = PointStatus::TrackPlus(p.status.name());
+            }
+        }
+        Ok(Tracks { points })
+    }
+}
+
+fn match_of(point: &Point) -> Match {
+    let ok = point.status.is_ok();
+    Match {
+        pair: PixelPair {
+            minus_px: [point.x, point.y],
+            plus_px: if ok { displaced(point) } else { [f64::NAN; 2] },
+        },
+        sigma_px: sigma(point),
+        status: if ok { PointStatus::Ok } else { PointStatus::Match(point.status.name()) },
+    }
+}
+
+/// Displacements to be searched from the −1 to the +1 view: what the heights allow over the whole view.
+fn disparity(
+    model: &OpticalModel,
+    view: &Rectangle,
+    height_mm: [f64; 2],
+) -> Result<((f64, f64), (f64, f64)), Error> {
+    let (left, top) = (view.x as f64, view.y as f64);
+    let (right, bottom) = (left + view.width as f64, top + view.height as f64);
+    let (mut u, mut v) = ((f64::INFINITY, f64::NEG_INFINITY), (f64::INFINITY, f64::NEG_INFINITY));
+    for pixel in [[left, top], [right, top], [left, bottom], [right, bottom]] {
+        let range = model.disparity_range(pixel, height_mm)?;
+        u = (u.0.min(range.u_px[0]), u.1.max(range.u_px[1]));
+        v = (v.0.min(range.v_px[0]), v.1.max(range.v_px[1]));
+    }
+    let margin = U_MARGIN * u.0.abs().max(u.1.abs());
+    Ok(((u.0 - margin, u.1 + margin), (v.0 - V_MARGIN_PX, v.1 + V_MARGIN_PX)))
+}

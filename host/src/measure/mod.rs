@@ -1,0 +1,81 @@
+//! From frames with two first-order views to points in space.
+//!
+//! [`Reference`] finds the views of a frame and matches them; [`Reference::track`] follows the
+//! matched points into another frame; [`profile`] and [`displacement`] decode. The steps are kept
+//! apart because a calibration changes only the last.
+
+mod decode;
+mod files;
+mod matching;
+mod statistics;
+
+pub use decode::{Displacement, DisplacementPoint, Profile, ProfilePoint, displacement, profile};
+pub use files::{displacement_maps, displacement_table, height_map, profile_table, write_displacement, write_profile};
+pub use matching::{Match, Rectangle, Reference, Settings, Track, Tracks, image_of};
+pub use statistics::{Plane, Spread, plane_of, spread};
+
+/// Why a point has no result, or `ok`. Stable strings: they stand in files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum PointStatus {
+    /// Measured.
+    Ok,
+    /// The match between the views failed, with the correlation's reason.
+    Match(&'static str),
+    /// Tracking in the −1 view failed, with the correlation's reason.
+    TrackMinus(&'static str),
+    /// Tracking in the +1 view failed, with the correlation's reason.
+    TrackPlus(&'static str),
+    /// The optics has no such ray.
+    Decode,
+    /// The two rays miss each other by more than their uncertainty explains.
+    Gap,
+}
+
+impl PointStatus {
+    /// Whether the point has a result.
+    pub fn is_ok(self) -> bool {
+        self == Self::Ok
+    }
+}
+
+impl std::fmt::Display for PointStatus {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Ok => f.write_str("ok"),
+            Self::Match(reason) => write!(f, "match:{reason}"),
+            Self::TrackMinus(reason) => write!(f, "minus:{reason}"),
+            Self::TrackPlus(reason) => write!(f, "plus:{reason}"),
+            Self::Decode => f.write_str("decode"),
+            Self::Gap => f.write_str("gap"),
+        }
+    }
+}
+
+/// Points on the grid of the −1 view: column i, row j at pixel (x0 + i·step, y0 + j·step).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Grid {
+    /// Column of the first node, pixels.
+    pub x0: usize,
+    /// Row of the first node, pixels.
+    pub y0: usize,
+    /// Distance of nodes, pixels.
+    pub step: usize,
+    /// Nodes in a row.
+    pub columns: usize,
+    /// Rows of nodes.
+    pub rows: usize,
+    /// Which point stands at a node (row by row), if any.
+    pub nodes: Vec<Option<usize>>,
+}
+
+impl Grid {
+    /// No nodes: for points that need no map.
+    pub const fn none() -> Self {
+        Self { x0: 0, y0: 0, step: 1, columns: 0, rows: 0, nodes: Vec::new() }
+    }
+
+    /// Values of points, spread over the nodes; NaN at nodes without a point.
+    pub fn spread_over_nodes(&self, value_of: impl Fn(usize) -> f64) -> Vec<f64> {
+        self.nodes.iter().map(|node| node.map_or(f64::NAN, &value_of)).collect()
+    }
+}

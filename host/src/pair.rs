@@ -1,0 +1,111 @@
+//! 2D-DIC of two images: what `daic correlate` does.
+
+use crate::error::Error;
+use crate::measure::{Rectangle, image_of};
+use crate::progress::Progress;
+use crate::usage::{Clock, Seconds};
+use daic_correlate::{Guess, Observer, Point, Points, Reference, Roi, Settings, Stage, Target};
+use daic_dataset::{Column, GreyImage, Table};
+use std::sync::Mutex;
+
+/// Points of a pair of images and what they cost.
+#[derive(Debug)]
+pub struct PairResult {
+    /// One entry per point of interest, row by row.
+    pub points: Vec<Point>,
+    /// Images to coefficients and gradients.
+    pub prepare: Seconds,
+    /// First displacements.
+    pub init: Seconds,
+    /// All points.
+    pub solve: Seconds,
+    /// Together.
+    pub total: Seconds,
+}
+
+impl PairResult {
+    /// Points with a result.
+    pub fn converged(&self) -> usize {
+        self.points.iter().filter(|p| p.status.is_ok()).count()
+    }
+
+    /// `x,y,u,v,sigma_u,sigma_v,zncc,iterations,status`, pixels, a row per point.
+    ///
+    /// # Errors
+    /// Only if two columns had one name.
+    pub fn table(&self) -> Result<Table, Error> {
+        let column = |f: &dyn Fn(&Point) -> f64| Column::F64(self.points.iter().map(f).collect());
+        let iterations = self.points.iter().map(|p| i64::from(p.iterations)).collect();
+        let status = self.points.iter().map(|p| p.status.name().to_owned()).collect();
+        Ok(Table::new()
+            .with("x", column(&|p| p.x))?
+            .with("y", column(&|p| p.y))?
+            .with("u", column(&|p| p.u))?
+            .with("v", column(&|p| p.v))?
+            .with("sigma_u", column(&|p| f64::from(p.sigma_u)))?
+            .with("sigma_v", column(&|p| f64::from(p.sigma_v)))?
+            .with("zncc", column(&|p| f64::from(p.zncc)))?
+            .with("iterations", Column::I64(iterations))?
+            .with("status", Column::Text(status))?)
+    }
+}
+
+/// Watches the stages to time them, and hands the progress on.
+struct Watch<'a> {
+    progress: &'a dyn Progress,
+    clock: Clock,
+    begin_of_solve: Mutex<Seconds>,
+}
+
+impl Observer for Watch<'_> {
+    fn stage(&self, stage: Stage) {
+        match stage {
+            Stage::Init => self.progress.stage("finding first displacements", 0),
+            Stage::Solve => {
+                if let Ok(mut begin) = self.begin_of_solve.lock() {
+                    *begin = self.clock.elapsed();
+                }
+            }
+        }
+    }
+
+    fn points(&self, done: usize, total: usize) {
+        if done == 0 {
+            self.progress.stage("correlating", total as u64);
+        }
+        self.progress.advance(done as u64);
+    }
+}
+
+/// Correlates `deformed` with `reference` on a grid of `step` pixels.
+///
+/// # Errors
+/// A setting that cannot be used.
+pub fn correlate(
+    reference: &GreyImage,
+    deformed: &GreyImage,
+    settings: &Settings,
+    step: usize,
+    roi: Option<Rectangle>,
+    progress: &dyn Progress,
+) -> Result<PairResult, Error> {
+    let clock = Clock::start();
+    let (a, b) = (image_of(reference)?, image_of(deformed)?);
+    settings.validate_for(a.width(), a.height())?;
+    let points = Points::grid(a.width(), a.height(), settings.subset, step, &Roi { rectangle: roi, mask: None })?;
+    progress.stage("preparing the images", 0);
+    let (subsets, target) = rayon::join(|| Reference::new(a), || Target::new(b, settings.interpolation));
+    let prepare = clock.elapsed();
+    let watch = Watch { progress, clock, begin_of_solve: Mutex::default() };
+    let found = daic_correlate::correlate(&subsets, &target, &points, &Guess::Fft, settings, &watch)?;
+    let total = clock.elapsed();
+    let begin = watch.begin_of_solve.into_inner().unwrap_or_default();
+    let between = |from: Seconds, to: Seconds| Seconds { cpu: to.cpu - from.cpu, wall: to.wall - from.wall };
+    Ok(PairResult {
+        points: found.points,
+        prepare,
+        init: between(prepare, begin),
+        solve: between(begin, total),
+        total,
+    })
+}

@@ -1,0 +1,173 @@
+//! Calibration of distances and F from the calibration frames of a dataset.
+
+use super::summary::{CalibratedParameter, CalibrationSummary};
+use crate::error::Error;
+use crate::measure::{self, Match, Tracks};
+use daic_optics::calibrate::{Observation, Settings, TrackedPoint, calibrate};
+use daic_optics::{Decoder, OpticalModel, Optics, Parameter, PixelPair};
+use nalgebra::Vector3;
+
+/// Points within this radius of the optical axis make the surface whose height there is known.
+const AXIS_RADIUS_MM: f64 = 1.5;
+/// Fewest points for that.
+const AXIS_POINTS: usize = 30;
+/// What a sub-pixel σ of zero would claim no camera can; keeps the weights finite.
+const LEAST_SIGMA_PX: f64 = 1e-4;
+
+/// One calibration frame: where the stage stood relative to the reference, and the tracked points.
+pub struct Moved {
+    /// Displacement of the specimen from the reference frame (x, y, h), millimetres.
+    pub displacement_mm: [f64; 3],
+    /// The reference's points in this frame.
+    pub tracks: Tracks,
+}
+
+/// Estimates F and s from the moves, then d from the known height of the specimen on the optical axis.
+///
+/// Moves alone say nothing about d: it only says from where heights are counted. So the height of the
+/// specimen where the optical axis meets it, at the reference position, is the datum.
+///
+/// # Errors
+/// If the moves do not determine a parameter, or there is no surface near the axis.
+pub fn run(
+    start: &Optics,
+    matches: &[Match],
+    moved: &[Moved],
+    axis_height_mm: f64,
+) -> Result<(Optics, CalibrationSummary), Error> {
+    let mut displacements = vec![Vector3::zeros()];
+    displacements.extend(moved.iter().map(|m| Vector3::from(m.displacement_mm)));
+    let points: Vec<TrackedPoint> = (0..matches.len())
+        .filter(|&k| matches[k].status.is_ok())
+        .map(|k| {
+            let home = observation(matches[k].pair, [0.0; 2], matches[k].sigma_px);
+            let mut frames = vec![Some(home)];
+            frames.extend(moved.iter().map(|m| {
+                let track = &m.tracks.points[k];
+                let pair = PixelPair { minus_px: track.minus_px, plus_px: track.plus_px };
+                // the match between the views enters the +1 pixel of every frame
+                let match_and_track = [0, 1].map(|i| matches[k].sigma_px[i].hypot(track.sigma_plus_px[i]));
+                track.status.is_ok().then(|| observation(pair, track.sigma_minus_px, match_and_track))
+            }));
+            TrackedPoint { frames }
+        })
+        .collect();
+    let settings = Settings {
+        parameters: vec![Parameter::FocalPx, Parameter::PinholeToGrating],
+        reference_height_mm: None,
+        ..Settings::default()
+    };
+    let found = calibrate(start, &displacements, &points, &settings)?;
+    let mut optics = found.optics;
+
+    let model = OpticalModel::new(&optics)?;
+    let surface = measure::profile(&measure::Grid::none(), matches, &model, Decoder::Ray);
+    let near: Vec<[f64; 3]> = surface
+        .points
+        .iter()
+        .filter(|p| p.status.is_ok() && p.point_mm[0].hypot(p.point_mm[1]) <= AXIS_RADIUS_MM)
+        .map(|p| p.point_mm)
+        .collect();
+    let (height, height_sigma) = height_on_axis(&near).ok_or(Error::NoAxisPoints {
+        found: near.len(),
+        needed: AXIS_POINTS,
+        radius_mm: AXIS_RADIUS_MM,
+    })?;
+    optics.grating_to_reference_mm += axis_height_mm - height;
+
+    let mut parameters: Vec<CalibratedParameter> = found
+        .estimates
+        .iter()
+        .map(|e| CalibratedParameter {
+            name: unit_name(e.parameter).to_owned(),
+            start: e.start,
+            value: e.value,
+            sigma: e.sigma,
+        })
+        .collect();
+    parameters.push(CalibratedParameter {
+        name: unit_name(Parameter::GratingToReference).to_owned(),
+        start: start.grating_to_reference_mm,
+        value: optics.grating_to_reference_mm,
+        sigma: datum_sigma(&found, &model, height_sigma),
+    });
+    let summary = CalibrationSummary {
+        parameters,
+        rms_px: found.rms_px,
+        chi_square_reduced: found.chi_square_reduced,
+        points: found.points,
+        observations: found.observations,
+        rejected: found.rejected.len(),
+    };
+    Ok((optics, summary))
+}
+
+fn observation(pair: PixelPair, minus: [f64; 2], plus: [f64; 2]) -> Observation {
+    let sigma_px = [minus[0], minus[1], plus[0], plus[1]].map(|s| s.max(LEAST_SIGMA_PX));
+    Observation { pair, sigma_px }
+}
+
+/// The parameter's field with its unit.
+fn unit_name(parameter: Parameter) -> &'static str {
+    parameter.name().trim_start_matches("camera.")
+}
+
+/// Height at x = y = 0 of the second-order surface through the points, and its standard deviation from
+/// their scatter.
+fn height_on_axis(points: &[[f64; 3]]) -> Option<(f64, f64)> {
+    use nalgebra::{SMatrix, SVector};
+    if points.len() < AXIS_POINTS {
+        return None;
+    }
+    let row = |p: &[f64; 3]| {
+        let [x, y, _] = *p;
+        SVector::<f64, 6>::from([1.0, x, y, x * x, x * y, y * y])
+    };
+    let mut normal = SMatrix::<f64, 6, 6>::zeros();
+    let mut right = SVector::<f64, 6>::zeros();
+    for p in points {
+        let r = row(p);
+        normal += r * r.transpose();
+        right += r * p[2];
+    }
+    let inverse = normal.cholesky()?.inverse();
+    let coefficients = inverse * right;
+    let squares: f64 = points.iter().map(|p| (p[2] - row(p).dot(&coefficients)).powi(2)).sum();
+    let variance = squares / (points.len() - 6) as f64;
+    Some((coefficients[0], (variance * inverse[(0, 0)]).sqrt()))
+}
+
+/// How the uncertainty of F and s carries over to the height on the axis, and with it to d.
+fn datum_sigma(
+    found: &daic_optics::calibrate::Calibration,
+    model: &OpticalModel,
+    height_sigma: f64,
+) -> f64 {
+    let axis = Vector3::zeros();
+    let pair = (model.project(daic_optics::View::Minus, axis), model.project(daic_optics::View::Plus, axis));
+    let (Ok(minus_px), Ok(plus_px)) = pair else { return f64::NAN };
+    let Ok(jacobian) = model.parameter_jacobian(Decoder::Ray, PixelPair { minus_px, plus_px }) else {
+        return f64::NAN;
+    };
+    let by = [jacobian[(2, 0)], jacobian[(2, 1)]];
+    let c = &found.covariance;
+    let carried = by[0] * by[0] * c[(0, 0)] + 2.0 * by[0] * by[1] * c[(0, 1)] + by[1] * by[1] * c[(1, 1)];
+    (carried.max(0.0) + height_sigma * height_sigma).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_height_on_the_axis_of_a_second_order_surface_is_exact() {
+        let points: Vec<[f64; 3]> = (0..10)
+            .flat_map(|i| (0..10).map(move |j| (f64::from(i) * 0.2 - 0.7, f64::from(j) * 0.2 - 1.1)))
+            .map(|(x, y)| [x, y, 0.4 + 0.1 * x - 0.2 * y - 0.01 * x * x + 0.03 * x * y - 0.02 * y * y])
+            .collect();
+        let (height, sigma) = height_on_axis(&points).expect("enough points");
+        assert!((height - 0.4).abs() < 1e-12, "{height}");
+        assert!(sigma < 1e-12);
+        assert!(height_on_axis(&points[..10]).is_none());
+    }
+}

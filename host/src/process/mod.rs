@@ -1,0 +1,372 @@
+//! From a recorded dataset to results: calibration, profile, displacements, summary, report.
+//!
+//! Everything comes from the recorded frames and events alone. Each frame's results are complete or
+//! absent, and belong to a key over settings and input: a second run does what the first left.
+
+mod calibration;
+mod report;
+mod summary;
+
+pub use summary::{
+    CalibratedParameter, CalibrationSummary, FieldSummary, FrameCounts, FrameSummary, ProfileSummary, Summary,
+};
+
+use crate::error::Error;
+use crate::expand;
+use crate::measure::{self, Displacement, Profile, Reference, spread};
+use crate::optics_section;
+use crate::progress::Progress;
+use daic_dataset::{Damage, Dataset, FrameRecord, FrameRole, Verdict, atomic, result_key};
+use daic_optics::{OpticalModel, Optics};
+use daic_protocol::program::Instruction;
+use daic_rig::experiment::{Experiment, OpticsFile};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// Name of the manifest's field that holds the program played, as hexadecimal text.
+pub const PROGRAM: &str = "program";
+/// Name of the manifest's field that holds the axes' steps at the begin of the run.
+pub const START_STEPS: &str = "start_steps";
+
+/// What `results/<reference>/result.json` holds.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+struct ReferenceResult {
+    profile: ProfileSummary,
+    /// x, y, width, height of the −1 view.
+    minus: [usize; 4],
+    /// The same of the +1 view.
+    plus: [usize; 4],
+}
+
+/// What was done, and what a careful user wants to know about the dataset.
+#[derive(Debug)]
+pub struct Processed {
+    /// The numbers, as in `summary.json`.
+    pub summary: Summary,
+    /// What could not be read of the dataset.
+    pub damage: Vec<Damage>,
+    /// Frames whose results were there already.
+    pub resumed: usize,
+}
+
+/// Measures every paired frame of the dataset in `root`.
+///
+/// `fresh` measures anew what has been measured already.
+///
+/// # Errors
+/// A dataset without paired frames, or anything that [`crate::Error`] names.
+pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Processed, Error> {
+    let dataset = Dataset::open(root)?;
+    let experiment_path = root.join("experiment.toml");
+    let experiment = Experiment::parse(&dataset.experiment_toml()?, &experiment_path)?;
+    let contents = dataset.frames()?;
+    let mut damage = contents.damage;
+    damage.extend(dataset.events()?.damage);
+    let paired: Vec<&FrameRecord> = contents.records.iter().filter(|f| f.verdict == Verdict::Paired).collect();
+    let first = paired.iter().find(|f| f.role == FrameRole::Reference).or(paired.first());
+    let reference_record: &FrameRecord =
+        first.ok_or_else(|| Error::NoPairedFrame { root: root.to_owned(), frames: contents.records.len() })?;
+
+    let settings = crate::settings::measure_settings(&experiment.processing);
+    let mut run = Run {
+        dataset: &dataset,
+        experiment: &experiment,
+        settings,
+        reference: None,
+        reference_record,
+        fresh,
+        progress,
+        resumed: 0,
+    };
+    let start = optics_section::from_section(&experiment.optics)?;
+    let (optics, calibration) = run.calibrated(&paired, &start)?;
+    write_optics(&dataset.results(), &experiment, &optics, calibration.as_ref())?;
+    let reference = run.profile(&optics)?;
+    let mut measured = Vec::new();
+    for record in &paired {
+        if record.role == FrameRole::Measurement {
+            measured.push(run.displacement(record, &optics)?);
+        }
+    }
+    let resumed = run.resumed;
+
+    let (edge_error, edges_compared) = edge_error(&dataset)?;
+    let last = measured.last();
+    let summary = Summary {
+        daic: env!("CARGO_PKG_VERSION").to_owned(),
+        seed: dataset.manifest().seed,
+        frames: count(&contents.records),
+        commanded_um: last.and_then(|f| f.commanded_um),
+        measured_um: last.map(|f| f.field.measured_um),
+        rms_um: last.and_then(|f| f.rms_um),
+        sigma_um: last.map(|f| f.field.sigma_um),
+        edge_error_ticks_max: edge_error,
+        edges_compared,
+        calibration,
+        profile: reference.profile,
+        measured,
+    };
+    dataset.write_summary(&summary)?;
+    progress.stage("writing the report", 0);
+    let page = report::page(&dataset, &experiment, &summary, reference_record, &reference)?;
+    atomic::write_bytes(&dataset.report_path(), page.as_bytes())?;
+    Ok(Processed { summary, damage, resumed })
+}
+
+fn count(records: &[FrameRecord]) -> FrameCounts {
+    let of = |verdict| records.iter().filter(|f| f.verdict == verdict).count();
+    FrameCounts {
+        paired: of(Verdict::Paired),
+        missing: of(Verdict::Missing),
+        extra: of(Verdict::Extra),
+        ambiguous: of(Verdict::Ambiguous),
+    }
+}
+
+struct Run<'a> {
+    dataset: &'a Dataset,
+    experiment: &'a Experiment,
+    settings: measure::Settings,
+    /// Found and matched at first need: a resumed run may need it for nothing.
+    reference: Option<Reference>,
+    reference_record: &'a FrameRecord,
+    fresh: bool,
+    progress: &'a dyn Progress,
+    resumed: usize,
+}
+
+/// What `results/calibration.json` holds.
+#[derive(Serialize, Deserialize)]
+struct StoredCalibration {
+    key: String,
+    summary: CalibrationSummary,
+    optics: Optics,
+}
+
+impl Run<'_> {
+    /// Matches the reference once. The search range comes from the experiment's own optics, so that
+    /// the match does not depend on the calibration that follows.
+    fn reference(&mut self) -> Result<&Reference, Error> {
+        if self.reference.is_none() {
+            let frame = self.dataset.read_frame(self.reference_record)?;
+            let model = OpticalModel::new(&optics_section::from_section(&self.experiment.optics)?)?;
+            self.reference = Some(Reference::new(&frame, &model, &self.settings, self.progress)?);
+        }
+        self.reference.as_ref().ok_or(Error::Gratings)
+    }
+
+    fn key(&self, optics: &Optics, records: &[&FrameRecord]) -> Result<String, Error> {
+        let files: Vec<_> =
+            records.iter().filter_map(|r| Some(self.dataset.root().join(r.file.as_ref()?))).collect();
+        let settings = (&self.experiment.processing, optics, records.iter().map(|r| r.commanded_um).collect::<Vec<_>>());
+        Ok(result_key(env!("CARGO_PKG_VERSION"), &settings, &files)?)
+    }
+
+    /// Position of a frame relative to the reference, micrometres.
+    fn moved_um(&self, record: &FrameRecord) -> Option<[f64; 3]> {
+        let (to, from) = (record.commanded_um?, self.reference_record.commanded_um?);
+        Some([0, 1, 2].map(|i| to[i] - from[i]))
+    }
+
+    fn calibrated(
+        &mut self,
+        paired: &[&FrameRecord],
+        start: &Optics,
+    ) -> Result<(Optics, Option<CalibrationSummary>), Error> {
+        let frames: Vec<(&FrameRecord, [f64; 3])> = paired
+            .iter()
+            .filter(|f| f.role == FrameRole::Calibration)
+            .filter_map(|f| Some((*f, self.moved_um(f)?)))
+            .collect();
+        if frames.is_empty() || !self.experiment.processing.calibrate {
+            return Ok((*start, None));
+        }
+        let mut inputs = vec![self.reference_record];
+        inputs.extend(frames.iter().map(|f| f.0));
+        let key = self.key(start, &inputs)?;
+        let path = self.dataset.results().join("calibration.json");
+        if !self.fresh
+            && let Some(stored) = read_json::<StoredCalibration>(&path)
+            && stored.key == key
+        {
+            self.resumed += 1;
+            return Ok((stored.optics, Some(stored.summary)));
+        }
+        let mut moved = Vec::new();
+        for (record, move_um) in frames {
+            let image = self.dataset.read_frame(record)?;
+            let progress = self.progress;
+            let tracks = self.reference()?.track(&image, progress)?;
+            moved.push(calibration::Moved { displacement_mm: move_um.map(|um| um * 1e-3), tracks });
+        }
+        self.progress.stage("calibrating", 0);
+        let axis_height_mm = self.experiment.processing.axis_height.mm();
+        let matches = &self.reference()?.matches;
+        let (optics, summary) = calibration::run(start, matches, &moved, axis_height_mm)?;
+        write_json(&path, &StoredCalibration { key, summary: summary.clone(), optics })?;
+        Ok((optics, Some(summary)))
+    }
+
+    fn profile(&mut self, optics: &Optics) -> Result<ReferenceResult, Error> {
+        let record = self.reference_record;
+        let key = self.key(optics, &[record])?;
+        let directory = self.dataset.frame_results(record.id);
+        if !self.fresh
+            && self.dataset.is_done(record.id, &key)
+            && let Some(done) = read_json(&directory.join("result.json"))
+        {
+            self.resumed += 1;
+            return Ok(done);
+        }
+        let model = OpticalModel::new(optics)?;
+        let decoder = crate::settings::decoder(self.experiment.processing.decoder);
+        let reference = self.reference()?;
+        let profile = measure::profile(&reference.grid, &reference.matches, &model, decoder);
+        let corners = |r: measure::Rectangle| [r.x, r.y, r.width, r.height];
+        let result = ReferenceResult {
+            profile: profile_summary(&profile),
+            minus: corners(reference.minus),
+            plus: corners(reference.plus),
+        };
+        let directory = self.dataset.begin_results(record.id)?;
+        measure::write_profile(&directory, &profile)?;
+        write_json(&directory.join("result.json"), &result)?;
+        self.dataset.mark_done(record.id, &key)?;
+        Ok(result)
+    }
+
+    fn displacement(&mut self, record: &FrameRecord, optics: &Optics) -> Result<FrameSummary, Error> {
+        let key = self.key(optics, &[self.reference_record, record])?;
+        let directory = self.dataset.frame_results(record.id);
+        if !self.fresh
+            && self.dataset.is_done(record.id, &key)
+            && let Some(done) = read_json(&directory.join("result.json"))
+        {
+            self.resumed += 1;
+            return Ok(done);
+        }
+        let image = self.dataset.read_frame(record)?;
+        let model = OpticalModel::new(optics)?;
+        let decoder = crate::settings::decoder(self.experiment.processing.decoder);
+        let commanded_um = self.moved_um(record);
+        let progress = self.progress;
+        let reference = self.reference()?;
+        let tracks = reference.track(&image, progress)?;
+        let displacement =
+            measure::displacement(&reference.grid, &reference.matches, &tracks, &model, decoder);
+        let result = frame_summary(record, commanded_um, &displacement);
+        let directory = self.dataset.begin_results(record.id)?;
+        measure::write_displacement(&directory, &displacement)?;
+        write_json(&directory.join("result.json"), &result)?;
+        self.dataset.mark_done(record.id, &key)?;
+        Ok(result)
+    }
+}
+
+/// A profile in numbers.
+pub fn profile_summary(profile: &Profile) -> ProfileSummary {
+    let ok = || profile.points.iter().filter(|p| p.status.is_ok());
+    ProfileSummary {
+        points: profile.points.len(),
+        ok: ok().count(),
+        mean_h_mm: spread(ok().map(|p| p.point_mm[2])).mean,
+        sigma_h_um: 1e3 * spread(ok().map(|p| p.sigma_mm[2])).rms,
+        mean_gap_um: 1e3 * profile.mean_gap_mm,
+    }
+}
+
+/// A displacement field in numbers.
+pub fn field_summary(displacement: &Displacement) -> FieldSummary {
+    let ok = || displacement.points.iter().filter(|p| p.status.is_ok());
+    let axis = |i: usize| spread(ok().map(|p| 1e3 * p.displacement_mm[i]));
+    FieldSummary {
+        measured_um: [0, 1, 2].map(|i| axis(i).mean),
+        std_um: [0, 1, 2].map(|i| axis(i).std),
+        sigma_um: [0, 1, 2].map(|i| 1e3 * spread(ok().map(|p| p.sigma_mm[i])).rms),
+        points: displacement.points.len(),
+        ok: ok().count(),
+    }
+}
+
+fn frame_summary(
+    record: &FrameRecord,
+    commanded_um: Option<[f64; 3]>,
+    displacement: &Displacement,
+) -> FrameSummary {
+    let ok = || displacement.points.iter().filter(|p| p.status.is_ok());
+    let against = |c: [f64; 3]| [0, 1, 2].map(|i| spread(ok().map(|p| 1e3 * p.displacement_mm[i] - c[i])).rms);
+    FrameSummary {
+        id: record.id,
+        name: record.name.clone(),
+        commanded_um,
+        rms_um: commanded_um.map(against),
+        field: field_summary(displacement),
+    }
+}
+
+/// Largest difference between played and expected edges, and how many were compared.
+fn edge_error(dataset: &Dataset) -> Result<(Option<u64>, usize), Error> {
+    let Some(played) = dataset.edges()? else { return Ok((None, 0)) };
+    let Some((program, position)) = stored_program(dataset) else { return Ok((None, 0)) };
+    let expected = expand::expand(&program, position)?;
+    // ticks of the record count from the boot of the box, those of the expansion from the begin of the run
+    let begin = run_begin(dataset)?.unwrap_or(0);
+    let played: Vec<(u64, u32)> =
+        played.into_iter().filter(|e| e.0 >= begin).map(|(tick, word)| (tick - begin, word)).collect();
+    Ok((expand::largest_error(&expected, &played), expected.len()))
+}
+
+fn stored_program(dataset: &Dataset) -> Option<(Vec<Instruction>, [i32; 6])> {
+    let extra = &dataset.manifest().extra;
+    let text = extra.get(PROGRAM)?.as_str()?;
+    let bytes: Option<Vec<u8>> = (0..text.len())
+        .step_by(2)
+        .map(|i| u8::from_str_radix(text.get(i..i + 2)?, 16).ok())
+        .collect();
+    let position = serde_json::from_value(extra.get(START_STEPS)?.clone()).ok()?;
+    let instructions: Result<Vec<Instruction>, _> =
+        daic_protocol::program::decode(&bytes?).map(|(_, instruction)| instruction).collect();
+    Some((instructions.ok()?, position))
+}
+
+/// Tick of the begin of the (last) run, from the events.
+fn run_begin(dataset: &Dataset) -> Result<Option<u64>, Error> {
+    let events = dataset.events()?.records;
+    Ok(events.iter().rev().find(|e| e.kind == "RunStarted").map(|e| e.tick))
+}
+
+fn write_optics(
+    directory: &Path,
+    experiment: &Experiment,
+    optics: &Optics,
+    calibration: Option<&CalibrationSummary>,
+) -> Result<(), Error> {
+    let provenance = calibration.map_or_else(
+        || "as in the experiment file, not calibrated".to_owned(),
+        |c| format!("focal, distances calibrated from {} points, residual {:.4} px RMS", c.points, c.rms_px),
+    );
+    let file = OpticsFile {
+        format: Some(OpticsFile::FORMAT.to_owned()),
+        provenance: Some(provenance),
+        optics: optics_section::with_calibrated(&experiment.optics, optics),
+    };
+    let path = directory.join("optics.toml");
+    let text = file.to_toml().map_err(|source| Error::Unwritable { path: path.clone(), reason: source.to_string() })?;
+    std::fs::create_dir_all(directory).map_err(|source| Error::Folder { path: directory.to_owned(), source })?;
+    Ok(atomic::write_bytes(&path, text.as_bytes())?)
+}
+
+fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Option<T> {
+    serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+}
+
+fn write_json(path: &Path, value: &impl Serialize) -> Result<(), Error> {
+    if let Some(directory) = path.parent() {
+        std::fs::create_dir_all(directory)
+            .map_err(|source| Error::Folder { path: directory.to_owned(), source })?;
+    }
+    let mut text = serde_json::to_string_pretty(value)
+        .map_err(|source| Error::Unwritable { path: path.to_owned(), reason: source.to_string() })?;
+    text.push('\n');
+    Ok(atomic::write_bytes(path, text.as_bytes())?)
+}

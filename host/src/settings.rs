@@ -1,0 +1,43 @@
+//! From the `[processing]` section to what the crates want.
+
+use crate::measure;
+use daic_rig::experiment::{self, Processing};
+
+/// Measurement settings of an experiment.
+pub fn measure_settings(processing: &Processing) -> measure::Settings {
+    measure::Settings {
+        dic: daic_correlate::Settings {
+            subset: processing.subset as usize,
+            shape: match processing.shape {
+                experiment::Shape::Affine => daic_correlate::Shape::Affine,
+                experiment::Shape::Quadratic => daic_correlate::Shape::Quadratic,
+            },
+            interpolation: match processing.interpolation {
+                experiment::Interpolation::Cubic => daic_correlate::Interpolation::Cubic,
+                experiment::Interpolation::Quintic => daic_correlate::Interpolation::Quintic,
+            },
+            tolerance: processing.convergence,
+            max_iterations: processing.max_iterations,
+            min_zncc: processing.min_zncc,
+            noise: processing.noise,
+            ..daic_correlate::Settings::default()
+        },
+        step: processing.step as usize,
+        roi: processing.roi.map(|[left, right, top, bottom]| measure::Rectangle {
+            x: left as usize,
+            y: top as usize,
+            width: (right.saturating_sub(left) + 1) as usize,
+            height: (bottom.saturating_sub(top) + 1) as usize,
+        }),
+        ..measure::Settings::default()
+    }
+}
+
+/// The decoder of that name.
+pub fn decoder(decoder: experiment::Decoder) -> daic_optics::Decoder {
+    match decoder {
+        experiment::Decoder::Ray => daic_optics::Decoder::Ray,
+        experiment::Decoder::Closed => daic_optics::Decoder::Closed,
+        experiment::Decoder::Linear => daic_optics::Decoder::Linear,
+    }
+}

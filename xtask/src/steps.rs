@@ -1,0 +1,131 @@
+//! The steps behind the commands.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+/// What became of one step.
+enum Outcome {
+    Passed,
+    Failed(String),
+    NotRun(String),
+}
+
+/// Steps in the order they ran.
+#[derive(Default)]
+pub struct Report(Vec<(String, Outcome, Duration)>);
+
+impl Report {
+    pub fn append(&mut self, mut other: Report) {
+        self.0.append(&mut other.0);
+    }
+
+    pub fn failed(&self) -> bool {
+        self.0.iter().any(|(_, outcome, _)| matches!(outcome, Outcome::Failed(_)))
+    }
+
+    pub fn print(&self) {
+        println!("\nsummary");
+        for (name, outcome, took) in &self.0 {
+            let seconds = took.as_secs_f64();
+            match outcome {
+                Outcome::Passed => println!("  passed   {name} ({seconds:.0} s)"),
+                Outcome::Failed(why) => println!("  FAILED   {name} ({seconds:.0} s): {why}"),
+                Outcome::NotRun(why) => println!("  NOT RUN  {name}: {why}"),
+            }
+        }
+    }
+
+    fn step(&mut self, name: &str, run: impl FnOnce() -> Outcome) {
+        println!("\n=== {name}");
+        let start = Instant::now();
+        let outcome = run();
+        self.0.push((name.to_owned(), outcome, start.elapsed()));
+    }
+}
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new(".")).to_owned()
+}
+
+fn cargo(arguments: &[&str]) -> Command {
+    let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    command.args(arguments).current_dir(root());
+    command
+}
+
+fn outcome_of(mut command: Command) -> Outcome {
+    match command.status() {
+        Ok(status) if status.success() => Outcome::Passed,
+        Ok(status) => Outcome::Failed(status.to_string()),
+        Err(error) => Outcome::Failed(format!("{command:?} did not start: {error}")),
+    }
+}
+
+pub fn test() -> Report {
+    let mut report = Report::default();
+    report.step("tests of the workspace", || outcome_of(cargo(&["test", "--workspace", "--locked"])));
+    report.step("firmware for thumbv6m-none-eabi", thumb);
+    report.step("data of others", || {
+        let shared = std::env::var_os("DAIC_SHARED").map_or_else(|| root().join("../shared"), PathBuf::from);
+        if shared.join("golden").is_dir() && shared.join("data").is_dir() {
+            Outcome::Passed
+        } else {
+            Outcome::NotRun(format!(
+                "no golden/ and data/ in {}: the tests against golden answers and real images printed SKIPPED; set DAIC_SHARED to where they are",
+                shared.display()
+            ))
+        }
+    });
+    report
+}
+
+/// Builds protocol and firmware for the Pico's core, with a toolchain brought into `target/thumb`
+/// where rustup has none.
+fn thumb() -> Outcome {
+    let script = root().join("ci/thumb-toolchain.sh");
+    let output = match Command::new("bash").arg(&script).stderr(std::process::Stdio::inherit()).output() {
+        Ok(output) => output,
+        Err(error) => return Outcome::NotRun(format!("bash did not start: {error}")),
+    };
+    if !output.status.success() {
+        return Outcome::NotRun(format!(
+            "no Rust toolchain for thumbv6m-none-eabi could be had ({}); `rustup target add thumbv6m-none-eabi` brings one",
+            output.status
+        ));
+    }
+    let environment = String::from_utf8_lossy(&output.stdout);
+    let mut build = cargo(&["build", "--locked", "--release", "--target", "thumbv6m-none-eabi", "-p", "daic-protocol", "-p", "daic-firmware"]);
+    // a directory of its own: the compiler may be another than the one that built the rest
+    build.env("CARGO_TARGET_DIR", root().join("target/thumb-build"));
+    for line in environment.lines() {
+        for pair in line.strip_prefix("export ").unwrap_or_default().split_whitespace() {
+            if let Some((name, value)) = pair.split_once('=') {
+                build.env(name, value);
+            }
+        }
+    }
+    outcome_of(build)
+}
+
+pub fn lint() -> Report {
+    let mut report = Report::default();
+    report.step("formatting", || outcome_of(cargo(&["fmt", "--all", "--check"])));
+    report.step("clippy", || {
+        outcome_of(cargo(&["clippy", "--workspace", "--all-targets", "--locked", "--", "-D", "warnings"]))
+    });
+    report.step("documentation", || {
+        let mut command = cargo(&["doc", "--workspace", "--no-deps", "--locked"]);
+        command.env("RUSTDOCFLAGS", "-D warnings");
+        outcome_of(command)
+    });
+    report.step("licences, sources and bans (cargo-deny)", || {
+        match cargo(&["deny", "--version"]).output() {
+            Ok(output) if output.status.success() => {
+                outcome_of(cargo(&["deny", "--offline", "check", "licenses", "bans", "sources"]))
+            }
+            _ => Outcome::NotRun("cargo-deny is not installed (`cargo install cargo-deny`)".into()),
+        }
+    });
+    report
+}
