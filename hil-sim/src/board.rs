@@ -232,7 +232,9 @@ impl BoardThread {
             self.publish();
             let next = self.due().into_iter().chain(self.world.camera_free_at()).min();
             let nap = next.map_or(NAP, |due| {
-                Duration::from_secs_f64((due.saturating_sub(self.now) as f64 / ticks_per_s).min(NAP.as_secs_f64()))
+                Duration::from_secs_f64(
+                    (due.saturating_sub(self.now) as f64 / ticks_per_s).min(NAP.as_secs_f64()),
+                )
             });
             let count = self.link.read(&mut buffer, nap);
             if count > 0 {
@@ -252,7 +254,8 @@ impl BoardThread {
     }
 
     fn play_until(&mut self, tick: u64) {
-        let mut wires = Wires { world: &mut self.world, record: lock(&self.shared.record), boot_tick: self.boot_tick };
+        let mut wires =
+            Wires { world: &mut self.world, record: lock(&self.shared.record), boot_tick: self.boot_tick };
         self.controller.play(tick.saturating_sub(self.boot_tick), &mut wires);
     }
 
@@ -264,8 +267,11 @@ impl BoardThread {
         let mut silent = self.shared.silent.load(Ordering::Relaxed);
         let mut answered = self.answered;
         {
-            let mut wires =
-                Wires { world: &mut self.world, record: lock(&self.shared.record), boot_tick: self.boot_tick };
+            let mut wires = Wires {
+                world: &mut self.world,
+                record: lock(&self.shared.record),
+                boot_tick: self.boot_tick,
+            };
             self.controller.receive(self.now - self.boot_tick, bytes, &mut wires, &mut |reply| {
                 reset |= reset_after_requests == Some(answered) && self.boots == 1;
                 silent |= silent_after_requests.is_some_and(|limit| answered >= limit);
@@ -347,7 +353,12 @@ fn board(config: &BoardConfig) -> Board {
             .axes
             .iter()
             .take(usize::from(AXES))
-            .map(|a| AxisLimits { min: a.min, max: a.max, max_rate: a.max_rate, max_acceleration: a.max_acceleration })
+            .map(|a| AxisLimits {
+                min: a.min,
+                max: a.max,
+                max_rate: a.max_rate,
+                max_acceleration: a.max_acceleration,
+            })
             .collect(),
         leds: config
             .leds

@@ -24,7 +24,9 @@ pub enum ConfigError {
         max: f64,
     },
     /// First order would not leave the grating.
-    #[error("the grating pitch of {pitch_mm} mm is not above the wavelength of {wavelength_mm} mm: there is no first order")]
+    #[error(
+        "the grating pitch of {pitch_mm} mm is not above the wavelength of {wavelength_mm} mm: there is no first order"
+    )]
     PitchBelowWavelength {
         /// Pitch.
         pitch_mm: f64,

@@ -99,7 +99,8 @@ impl Imager {
         let (width, height) = self.scene.size();
         let positions = exposure.light.positions();
         let electrons: f64 = positions.iter().map(|p| p.electrons).sum();
-        let mean = [0, 1, 2].map(|k| positions.iter().map(|p| p.stage_mm[k] * p.electrons).sum::<f64>() / electrons);
+        let mean =
+            [0, 1, 2].map(|k| positions.iter().map(|p| p.stage_mm[k] * p.electrons).sum::<f64>() / electrons);
         let stage_mm = match &positions[..] {
             [] => None,
             [one] => Some(one.stage_mm),

@@ -71,7 +71,10 @@ impl Failure {
     /// 2: what was given cannot be used; 3: the rig cannot run.
     fn code(&self) -> u8 {
         match self {
-            Self::SceneUnreadable { .. } | Self::SceneRefused { .. } | Self::Config(_) | Self::Rig(SimError::Config(_)) => 2,
+            Self::SceneUnreadable { .. }
+            | Self::SceneRefused { .. }
+            | Self::Config(_)
+            | Self::Rig(SimError::Config(_)) => 2,
             _ => 3,
         }
     }
@@ -99,7 +102,8 @@ fn run(arguments: &Arguments) -> Result<(), Failure> {
         Some(path) => {
             let text = std::fs::read_to_string(path)
                 .map_err(|cause| Failure::SceneUnreadable { path: path.clone(), cause })?;
-            SimConfig::from_toml(&text).map_err(|cause| Failure::SceneRefused { path: path.clone(), cause })?
+            SimConfig::from_toml(&text)
+                .map_err(|cause| Failure::SceneRefused { path: path.clone(), cause })?
         }
     };
     config.seed = arguments.seed.unwrap_or(config.seed);

@@ -66,7 +66,7 @@ fn line_name(bit: u8) -> String {
         0..=7 => format!("led{bit}"),
         8..=11 => format!("camera{}", bit - 8),
         12..=15 => format!("aux{}", bit - 12),
-        16..=27 if bit % 2 == 0 => format!("step{}", (bit - 16) / 2),
+        16..=27 if bit.is_multiple_of(2) => format!("step{}", (bit - 16) / 2),
         16..=27 => format!("direction{}", (bit - 17) / 2),
         _ => format!("bit{bit}"),
     }

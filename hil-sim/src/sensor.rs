@@ -25,27 +25,36 @@ impl Sensor {
     /// result does not depend on threads.
     pub fn read(&self, frame: u64, expected: &[f32]) -> Vec<u16> {
         let mut counts = vec![0u16; expected.len()];
-        counts.par_chunks_mut(self.width).zip(expected.par_chunks(self.width)).enumerate().for_each(|(y, (out, row))| {
-            let stream = mix(mix(mix(self.seed ^ 0x7365_6e73_6f72_2121) ^ frame) ^ y as u64);
-            for (x, (count, &mean)) in out.iter_mut().zip(row).enumerate() {
-                *count = self.pixel(stream ^ ((x as u64) << 1), f64::from(mean));
-            }
-        });
+        counts.par_chunks_mut(self.width).zip(expected.par_chunks(self.width)).enumerate().for_each(
+            |(y, (out, row))| {
+                let stream = mix(mix(mix(self.seed ^ 0x7365_6e73_6f72_2121) ^ frame) ^ y as u64);
+                for (x, (count, &mean)) in out.iter_mut().zip(row).enumerate() {
+                    *count = self.pixel(stream ^ ((x as u64) << 1), f64::from(mean));
+                }
+            },
+        );
         counts
     }
 
     #[inline]
     fn pixel(&self, stream: u64, mean: f64) -> u16 {
         let c = &self.config;
-        let (u, v) = (unit(mix(stream)), unit(mix(stream | 1)));
-        // Box–Muller: one normal for the photons, one for the amplifier.
-        let radius = (-2.0 * u.ln()).sqrt();
-        let (sin, cos) = (std::f64::consts::TAU * v).sin_cos();
-        let collected = if c.photon_noise && mean > 0.0 { poisson(mean, radius * cos, stream) } else { mean };
-        let electrons = collected.min(c.full_well_electrons) + c.read_noise_electrons * radius * sin;
+        let [photons, amplifier] = normals(stream);
+        let collected = if c.photon_noise && mean > 0.0 { poisson(mean, photons, stream) } else { mean };
+        let electrons = collected.min(c.full_well_electrons) + c.read_noise_electrons * amplifier;
         let largest = f64::from((1u32 << c.bits) - 1);
         (c.offset_dn + electrons / c.electrons_per_dn).round().clamp(0.0, largest) as u16
     }
+}
+
+/// Two independent standard normal numbers by Box–Muller.
+#[inline]
+fn normals(stream: u64) -> [f64; 2] {
+    // The complement is never another pixel's stream: those of a row share their lowest bit.
+    let (u, v) = (unit(mix(stream)), unit(mix(!stream)));
+    let radius = (-2.0 * u.ln()).sqrt();
+    let (sin, cos) = (std::f64::consts::TAU * v).sin_cos();
+    [radius * cos, radius * sin]
 }
 
 /// Below this mean a Poisson number is drawn exactly.
@@ -92,16 +101,18 @@ mod tests {
         let n = 400_000u64;
         for mean in [0.05, 0.7, 3.0, 15.9, 16.0, 16.5, 40.0, 300.0, 9000.0] {
             let draw = |i: u64| {
-                let stream = mix(i.wrapping_mul(2) ^ 77);
-                let (u, v) = (unit(mix(stream)), unit(mix(stream | 1)));
-                poisson(mean, (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos(), stream)
+                let stream = mix(i ^ 77);
+                poisson(mean, normals(stream)[0], stream)
             };
             let [m, v, t] = moments((0..n).map(draw));
             // Five standard errors: of the mean √(λ/n), of the variance √((λ + 2λ²)/n), of the third
             // moment about √((15λ³ + 40λ² + λ)/n).
             let n = n as f64;
             assert!((m - mean).abs() < 5.0 * (mean / n).sqrt(), "mean of {mean}: {m}");
-            assert!((v - mean).abs() < 5.0 * ((mean + 2.0 * mean * mean) / n).sqrt(), "variance of {mean}: {v}");
+            assert!(
+                (v - mean).abs() < 5.0 * ((mean + 2.0 * mean * mean) / n).sqrt(),
+                "variance of {mean}: {v}"
+            );
             let error = ((15.0 * mean.powi(3) + 40.0 * mean * mean + mean) / n).sqrt();
             assert!((t - mean).abs() < 5.0 * error, "third moment of {mean}: {t}");
         }
@@ -119,13 +130,37 @@ mod tests {
             let (e, g) = (f64::from(electrons), config.electrons_per_dn);
             let variance = (e + config.read_noise_electrons.powi(2)) / (g * g) + 1.0 / 12.0;
             assert!((m - config.offset_dn - e / g).abs() < 5.0 * (variance / n).sqrt(), "mean at {e}: {m}");
-            assert!((v / variance - 1.0).abs() < 5.0 * (2.0 / n).sqrt(), "variance at {e}: {v}, not {variance}");
+            assert!(
+                (v / variance - 1.0).abs() < 5.0 * (2.0 / n).sqrt(),
+                "variance at {e}: {v}, not {variance}"
+            );
+        }
+    }
+
+    /// Light and amplifier noise are independent, in even rows as in odd ones.
+    #[test]
+    fn normals_are_standard_and_independent() {
+        for base in [0x1234_5678, 0x1234_5679] {
+            let n = 200_000u64;
+            let pairs: Vec<[f64; 2]> = (0..n).map(|x| normals(base ^ (x << 1))).collect();
+            let limit = 5.0 / (n as f64).sqrt();
+            for k in 0..2 {
+                let [m, v, t] = moments(pairs.iter().map(|p| p[k]));
+                assert!(
+                    m.abs() < limit && (v - 1.0).abs() < 1.5 * limit && t.abs() < 4.0 * limit,
+                    "{m} {v} {t}"
+                );
+            }
+            let product = pairs.iter().map(|p| p[0] * p[1]).sum::<f64>() / n as f64;
+            let squares = pairs.iter().map(|p| p[0] * p[0] * p[1] * p[1]).sum::<f64>() / n as f64;
+            assert!(product.abs() < limit && (squares - 1.0).abs() < 9.0 * limit, "{product} {squares}");
         }
     }
 
     #[test]
     fn well_and_converter_saturate() {
-        let mut config = CameraConfig { width: 4, height: 1, read_noise_electrons: 0.0, ..CameraConfig::default() };
+        let mut config =
+            CameraConfig { width: 4, height: 1, read_noise_electrons: 0.0, ..CameraConfig::default() };
         config.photon_noise = false;
         let read = |config: &CameraConfig| Sensor::new(config, 0).read(0, &[0.0, 25.0, 9_000.0, 20_000.0]);
         assert_eq!(read(&config), [192, 202, 3792, 4095]);

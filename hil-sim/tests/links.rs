@@ -37,7 +37,14 @@ impl Drop for Tty {
 
 impl Tty {
     fn open(path: &str) -> Self {
-        let open = || OpenOptions::new().read(true).write(true).custom_flags(nix::libc::O_NOCTTY).open(path).expect("opens");
+        let open = || {
+            OpenOptions::new()
+                .read(true)
+                .write(true)
+                .custom_flags(nix::libc::O_NOCTTY)
+                .open(path)
+                .expect("opens")
+        };
         let (send, bytes) = channel();
         let mut reader = OpenOptions::new()
             .read(true)
@@ -58,7 +65,9 @@ impl Tty {
                             }
                         }
                     }
-                    Err(e) if e.kind() == std::io::ErrorKind::WouldBlock => std::thread::sleep(Duration::from_millis(1)),
+                    Err(e) if e.kind() == std::io::ErrorKind::WouldBlock => {
+                        std::thread::sleep(Duration::from_millis(1))
+                    }
                     Err(_) => return,
                 }
             }
@@ -103,8 +112,10 @@ fn exercise<S: Read + Write>(rig: &SimRig, host: &mut Host<S>) -> [SimFrame; 2] 
     let events = host.run(&two_frames());
     let Some(EventKind::RunDone { words, .. }) = events.last().map(|e| e.kind) else { panic!("{events:?}") };
     assert_eq!(words as usize, rig.played().len() - words_before);
-    let edges: Vec<(u64, u32)> =
-        events.iter().filter_map(|e| if let EventKind::Edge { word, .. } = e.kind { Some((e.tick, word)) } else { None }).collect();
+    let edges: Vec<(u64, u32)> = events
+        .iter()
+        .filter_map(|e| if let EventKind::Edge { word, .. } = e.kind { Some((e.tick, word)) } else { None })
+        .collect();
     assert!(!edges.is_empty());
     let played = rig.played();
     for edge in edges {
@@ -235,7 +246,8 @@ fn program_prints_its_port_serves_and_writes_frames() {
     let directory = tempfile::tempdir().expect("directory");
     let at = |name: &str| directory.path().join(name).to_str().expect("utf-8").to_owned();
     std::fs::write(at("scene.toml"), small().to_toml().expect("written")).expect("written");
-    let arguments = ["--scene", &at("scene.toml"), "--frames", &at("frames"), "--vcd", &at("out.vcd"), "--until-eof"];
+    let arguments =
+        ["--scene", &at("scene.toml"), "--frames", &at("frames"), "--vcd", &at("out.vcd"), "--until-eof"];
     let mut running = Running(program(&arguments).spawn().expect("runs"));
     let mut line = String::new();
     BufReader::new(running.0.stdout.take().expect("piped")).read_line(&mut line).expect("a line");
@@ -253,7 +265,8 @@ fn program_prints_its_port_serves_and_writes_frames() {
     };
     for line in lines.lines() {
         let line: serde_json::Value = serde_json::from_str(line).expect("json");
-        let image = image::open(directory.path().join("frames").join(line["file"].as_str().expect("name"))).expect("image");
+        let image = image::open(directory.path().join("frames").join(line["file"].as_str().expect("name")))
+            .expect("image");
         assert_eq!((image.width(), image.height(), image.color()), (324, 243, image::ColorType::L16));
     }
     drop(running.0.stdin.take());
@@ -288,6 +301,7 @@ fn program_ends_on_a_signal_and_refuses_bad_scenes() {
     assert_eq!(busy.status.code(), Some(3));
 
     let printed = program(&["--print-scene", "--seed", "9"]).output().expect("runs");
-    let config = daic_hil_sim::SimConfig::from_toml(&String::from_utf8(printed.stdout).expect("utf-8")).expect("valid");
+    let config = daic_hil_sim::SimConfig::from_toml(&String::from_utf8(printed.stdout).expect("utf-8"))
+        .expect("valid");
     assert_eq!(config, daic_hil_sim::SimConfig { seed: 9, ..Default::default() });
 }

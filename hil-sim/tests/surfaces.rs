@@ -16,7 +16,10 @@ fn lines() -> Vec<Line> {
                 let aim = [-10.2 + 0.51 * f64::from(i), -9.7 + 1.21 * f64::from(j)];
                 // 100 mm in front of the reference plane.
                 let t = 100.0 / direction[2];
-                list.push(Line { origin: [aim[0] + t * direction[0], aim[1] + t * direction[1], 100.0], direction });
+                list.push(Line {
+                    origin: [aim[0] + t * direction[0], aim[1] + t * direction[1], 100.0],
+                    direction,
+                });
             }
         }
     }
@@ -51,7 +54,10 @@ fn check(name: &str, surface: SurfaceConfig, tolerance: f64, height: impl Fn(f64
                 hits += 1;
                 assert!((hit[2] - h).abs() < 2e-3, "{name}: {hit:?}, walked to {h}");
                 let p = at(hit[2]);
-                assert!((p[0] - hit[0]).abs() < 1e-10 && (p[1] - hit[1]).abs() < 1e-10, "{name}: off the line");
+                assert!(
+                    (p[0] - hit[0]).abs() < 1e-10 && (p[1] - hit[1]).abs() < 1e-10,
+                    "{name}: off the line"
+                );
                 let on = height(hit[0], hit[1]).map_or(f64::INFINITY, |s| (s - hit[2]).abs());
                 worst = worst.max(on);
                 assert!(prepared.may_hit(&line, 0.0), "{name}: the box must hold every hit");
@@ -159,12 +165,14 @@ fn height_map_from_an_image() {
         image::Luma([((bowl(x, y) + 0.8) / 2.0 * 65_535.0).round() as u16])
     });
     image.save(&file).expect("saved");
-    let config = SurfaceConfig::HeightMap { file: file.clone(), pixel_mm: pixel, black_mm: -0.8, white_mm: 1.2 };
+    let config =
+        SurfaceConfig::HeightMap { file: file.clone(), pixel_mm: pixel, black_mm: -0.8, white_mm: 1.2 };
     // Half a grey value is 15 nm; the spline's overshoot makes that at most 3 times as much.
     check("height map", config, 4.6e-5, |x, y| Some(bowl(x, y)));
 
     let open = |file: &std::path::Path| {
-        let surface = SurfaceConfig::HeightMap { file: file.to_owned(), pixel_mm: pixel, black_mm: 0.0, white_mm: 1.0 };
+        let surface =
+            SurfaceConfig::HeightMap { file: file.to_owned(), pixel_mm: pixel, black_mm: 0.0, white_mm: 1.0 };
         Surface::new(&SpecimenConfig { surface, ..SpecimenConfig::default() })
     };
     let empty = directory.path().join("empty.png");

@@ -4,7 +4,7 @@
 //! the box, and the picture of a program before it is run.
 
 use daic_protocol::channels;
-use daic_protocol::limits::TICK_HZ;
+use daic_protocol::limits::{MIN_STEP_TICKS, TICK_HZ};
 use daic_protocol::program::Instruction;
 
 /// Word changes as (tick after the begin of the run, word), each differing from the one before; all
@@ -42,12 +42,15 @@ pub enum ExpandError {
 struct Expansion {
     edges: Edges,
     now: u64,
+    /// Tick of the last word, whether it changed anything or not.
+    last: u64,
     word: u32,
     position: [i32; 6],
 }
 
 impl Expansion {
     fn put(&mut self, tick: u64, word: u32) {
+        self.last = tick;
         if word != self.word {
             self.word = word;
             // an instruction may change the word again at the tick at which the last one ended
@@ -113,7 +116,7 @@ fn step_tick(k: u32, n: u32, rate: u32, acceleration: u32) -> u64 {
 /// # Errors
 /// [`ExpandError`] names the instruction.
 pub fn expand(program: &[Instruction], position: [i32; 6]) -> Result<Edges, ExpandError> {
-    let mut state = Expansion { edges: Vec::new(), now: 0, word: channels::SAFE_WORD, position };
+    let mut state = Expansion { edges: Vec::new(), now: 0, last: 0, word: channels::SAFE_WORD, position };
     let mut loops: Vec<(usize, u32)> = Vec::new();
     let mut at = 0;
     while let Some(&instruction) = program.get(at) {
@@ -151,13 +154,15 @@ pub fn expand(program: &[Instruction], position: [i32; 6]) -> Result<Edges, Expa
         }
         at += 1;
     }
-    state.put(state.now, channels::SAFE_WORD);
+    // a direction line that is still up falls a whole step after the last word
+    let end = state.now.max(state.last + u64::from(MIN_STEP_TICKS));
+    state.put(end, channels::SAFE_WORD);
     Ok(state.edges)
 }
 
 /// Leaves out words that change nothing; of several at one tick the last counts.
 pub fn changes(words: &[(u64, u32)]) -> Edges {
-    let mut all = Expansion { edges: Vec::new(), now: 0, word: channels::SAFE_WORD, position: [0; 6] };
+    let mut all = Expansion { edges: Vec::new(), now: 0, last: 0, word: channels::SAFE_WORD, position: [0; 6] };
     for &(tick, word) in words {
         all.put(tick, word);
     }

@@ -117,7 +117,8 @@ impl Lines {
 pub fn expand(program: &[Instruction]) -> Vec<(u64, u32)> {
     let mut lines = Lines::default();
     lines.play(&tree(&mut program.iter()));
-    lines.set(lines.now, 0);
+    let last = lines.changes.last().map_or(0, |change| change.0);
+    lines.set(lines.now.max(last + 4), 0);
     changes_only(&lines.changes)
 }
 

@@ -8,11 +8,8 @@ use crate::scene::Scene;
 fn quadrature(points: usize) -> &'static [(f64, f64)] {
     const ONE: [(f64, f64); 1] = [(0.0, 1.0)];
     const TWO: [(f64, f64); 2] = [(-0.288_675_134_594_812_9, 0.5), (0.288_675_134_594_812_9, 0.5)];
-    const THREE: [(f64, f64); 3] = [
-        (-0.387_298_334_620_741_7, 5.0 / 18.0),
-        (0.0, 8.0 / 18.0),
-        (0.387_298_334_620_741_7, 5.0 / 18.0),
-    ];
+    const THREE: [(f64, f64); 3] =
+        [(-0.387_298_334_620_741_7, 5.0 / 18.0), (0.0, 8.0 / 18.0), (0.387_298_334_620_741_7, 5.0 / 18.0)];
     const FOUR: [(f64, f64); 4] = [
         (-0.430_568_155_797_026_3, 0.173_927_422_568_727),
         (-0.169_990_521_792_428_1, 0.326_072_577_431_273),
@@ -54,7 +51,8 @@ impl Scene {
             let mut sum = 0.0;
             for &(dy, wy) in nodes {
                 for &(dx, wx) in nodes {
-                    let hit = self.line(view, x + dx, y + dy, shift).and_then(|line| self.surface.first_hit(&line));
+                    let hit =
+                        self.line(view, x + dx, y + dy, shift).and_then(|line| self.surface.first_hit(&line));
                     if let Some([px, py, _]) = hit {
                         sum += wx * wy * self.texture.reflectance(px, py);
                     }

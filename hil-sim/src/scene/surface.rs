@@ -56,7 +56,9 @@ impl Surface {
             SurfaceConfig::Cylinder { radius_mm, apex_mm, floor_mm } => {
                 (Shape::Cylinder { radius: *radius_mm, apex: *apex_mm }, *floor_mm)
             }
-            SurfaceConfig::Cone { apex_mm, slope, floor_mm } => (Shape::Cone { apex: *apex_mm, slope: *slope }, *floor_mm),
+            SurfaceConfig::Cone { apex_mm, slope, floor_mm } => {
+                (Shape::Cone { apex: *apex_mm, slope: *slope }, *floor_mm)
+            }
             SurfaceConfig::Step { x_mm, low_mm, high_mm } => {
                 (Shape::Step { x: *x_mm, low: *low_mm, high: *high_mm }, None)
             }
@@ -104,9 +106,7 @@ impl Surface {
                 let t = gap / (slope[0] * d[0] + slope[1] * d[1] - d[2]);
                 (t > 0.0).then(|| line.at(t))
             }
-            Shape::Cylinder { radius, apex } => {
-                round(line, [1.0, 0.0, 1.0], apex - radius, *radius)
-            }
+            Shape::Cylinder { radius, apex } => round(line, [1.0, 0.0, 1.0], apex - radius, *radius),
             Shape::Sphere { radius, apex } => round(line, [1.0; 3], apex - radius, *radius),
             Shape::Cone { apex, slope } => cone(line, *apex, *slope),
             Shape::Step { x, low, high } => step(line, *x, *low, *high),

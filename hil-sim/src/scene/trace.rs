@@ -53,7 +53,8 @@ impl Plate {
         let (sz, cz) = az.sin_cos();
         let turned = [sy * cx, -sx, cy * cx];
         let normal = [cz * turned[0] - sz * turned[1], sz * turned[0] + cz * turned[1], turned[2]];
-        let grating = Grating { pitch_mm: config.pitch_mm, tilt_rad_xyz: config.tilt_rad, substrate: Substrate::NONE };
+        let grating =
+            Grating { pitch_mm: config.pitch_mm, tilt_rad_xyz: config.tilt_rad, substrate: Substrate::NONE };
         Self { frame: grating.frame(), normal, thickness: config.substrate_mm, index: config.substrate_index }
     }
 }
@@ -101,7 +102,8 @@ impl Tracer {
     /// ray misses the grating's front or the order does not propagate.
     #[inline]
     pub fn line(&self, view: View, x_px: f64, y_px: f64) -> Option<ObjectLine> {
-        let observed = [(x_px - self.principal[0]) / self.focal_px, (y_px - self.principal[1]) / self.focal_px];
+        let observed =
+            [(x_px - self.principal[0]) / self.focal_px, (y_px - self.principal[1]) / self.focal_px];
         let [x, y] = if self.distorted { self.undistort(observed) } else { observed };
         let plate = &self.plates[view as usize];
         let n = plate.normal;
@@ -121,7 +123,8 @@ impl Tracer {
             // are parallel, so the direction behind is that of no glass at all.
             let along = n[0] * out.x + n[1] * out.y + n[2] * out.z;
             let side = [out.x - along * n[0], out.y - along * n[1], out.z - along * n[2]];
-            let sin2 = (side[0] * side[0] + side[1] * side[1] + side[2] * side[2]) / (plate.index * plate.index);
+            let sin2 =
+                (side[0] * side[0] + side[1] * side[1] + side[2] * side[2]) / (plate.index * plate.index);
             let per_thickness = 1.0 / (plate.index * (1.0 - sin2).sqrt());
             for i in 0..3 {
                 at[i] += plate.thickness * (n[i] + side[i] * per_thickness);

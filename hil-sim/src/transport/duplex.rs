@@ -54,8 +54,9 @@ impl Pipe {
     }
 
     fn write(&self, bytes: &[u8], timeout: Duration) -> io::Result<usize> {
-        let mut buffer =
-            self.wait(timeout, |b| b.bytes.len() < CAPACITY).ok_or(io::Error::from(io::ErrorKind::TimedOut))?;
+        let mut buffer = self
+            .wait(timeout, |b| b.bytes.len() < CAPACITY)
+            .ok_or(io::Error::from(io::ErrorKind::TimedOut))?;
         if buffer.closed {
             return Err(io::ErrorKind::BrokenPipe.into());
         }

@@ -4,8 +4,8 @@ mod duplex;
 mod pty;
 mod tcp;
 
-pub use duplex::DuplexEnd;
 pub(crate) use duplex::Connector;
+pub use duplex::DuplexEnd;
 
 use std::os::fd::AsFd;
 use std::path::PathBuf;

@@ -95,7 +95,8 @@ impl Link for Pty {
 
     fn drain(&mut self) {
         let end = Instant::now() + DRAIN_PATIENCE;
-        while rustix::io::ioctl_fionread(&self.slave).is_ok_and(|pending| pending > 0) && Instant::now() < end {
+        while rustix::io::ioctl_fionread(&self.slave).is_ok_and(|pending| pending > 0) && Instant::now() < end
+        {
             std::thread::sleep(Duration::from_millis(2));
         }
     }

@@ -44,7 +44,8 @@ impl Light {
         if electrons <= 0.0 {
             return;
         }
-        let group = Group { first_mm: stage_mm, moment: stage_mm.map(|p| p * electrons), electrons, moved: false };
+        let group =
+            Group { first_mm: stage_mm, moment: stage_mm.map(|p| p * electrons), electrons, moved: false };
         self.push(group);
         while self.positions.len() > self.most {
             // Too long a smear: coarser positions, so that a frame stays affordable.

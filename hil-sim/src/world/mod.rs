@@ -38,14 +38,19 @@ pub struct World {
 impl World {
     /// Everything at rest at tick 0, all lines low.
     pub fn new(config: &SimConfig) -> Self {
-        let pixel_mm = (config.scene.optics.pinhole_to_grating_mm + config.scene.optics.grating_to_reference_mm)
+        let pixel_mm = (config.scene.optics.pinhole_to_grating_mm
+            + config.scene.optics.grating_to_reference_mm)
             / config.scene.optics.focal_px;
         Self {
             tick: 0,
             word: daic_protocol::channels::SAFE_WORD,
             stage: Stage::new(&config.stage),
             lamps: Lamps::new(&config.light),
-            camera: Camera::new(&config.camera, config.scene.blur_step_px * pixel_mm, config.scene.blur_positions_max),
+            camera: Camera::new(
+                &config.camera,
+                config.scene.blur_step_px * pixel_mm,
+                config.scene.blur_positions_max,
+            ),
         }
     }
 

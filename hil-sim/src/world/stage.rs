@@ -25,7 +25,9 @@ impl Stage {
             return;
         }
         for (axis, steps) in (0u8..).zip(&mut self.steps) {
-            let (Some(step), Some(direction)) = (channels::step(axis), channels::direction(axis)) else { continue };
+            let (Some(step), Some(direction)) = (channels::step(axis), channels::direction(axis)) else {
+                continue;
+            };
             if risen & step != 0 {
                 *steps += if after & direction != 0 { 1 } else { -1 };
             }

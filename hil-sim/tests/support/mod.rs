@@ -105,7 +105,9 @@ impl<S: Read + Write> Host<S> {
         let mut events = Vec::new();
         let end = Instant::now() + Duration::from_secs(20);
         while Instant::now() < end {
-            let Reply::Events(reply) = self.request(&Request::ReadEvents { from }) else { panic!("no events") };
+            let Reply::Events(reply) = self.request(&Request::ReadEvents { from }) else {
+                panic!("no events")
+            };
             for event in reply.events {
                 from = event.seq + 1;
                 events.push(event);

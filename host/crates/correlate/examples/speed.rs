@@ -32,26 +32,13 @@ fn main() {
         1 => Shape::Affine,
         _ => Shape::Quadratic,
     };
-    let settings = Settings {
-        subset: number(3, 33),
-        shape,
-        ..Settings::default()
-    };
+    let settings = Settings { subset: number(3, 33), shape, ..Settings::default() };
     let roi = Roi {
-        rectangle: Some(Rectangle {
-            x: 40,
-            y: 40,
-            width: a.width() - 80,
-            height: a.height() - 80,
-        }),
+        rectangle: Some(Rectangle { x: 40, y: 40, width: a.width() - 80, height: a.height() - 80 }),
         mask: None,
     };
-    let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(1)
-        .build()
-        .expect("a thread");
-    let points = Points::grid(a.width(), a.height(), settings.subset, number(4, 5), &roi)
-        .expect("a grid");
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread");
+    let points = Points::grid(a.width(), a.height(), settings.subset, number(4, 5), &roi).expect("a grid");
     for _ in 0..number(7, 3) {
         let (a, b) = (a.clone(), b.clone());
         let (start, cpu0) = (Instant::now(), cpu());
@@ -59,8 +46,8 @@ fn main() {
             let reference = Reference::new(a);
             let target = Target::new(b, settings.interpolation);
             let prepare = start.elapsed();
-            let c = correlate(&reference, &target, &points, &Guess::Fft, &settings, &())
-                .expect("a correlation");
+            let c =
+                correlate(&reference, &target, &points, &Guess::Fft, &settings, &()).expect("a correlation");
             (c, prepare)
         });
         let total = cpu() - cpu0;

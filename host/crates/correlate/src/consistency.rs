@@ -100,13 +100,7 @@ fn chance_groups(
 }
 
 /// Whether two points, each extrapolated to the middle between them, agree.
-fn agrees(
-    points: &Points,
-    outcomes: &[Option<Outcome>],
-    a: usize,
-    b: usize,
-    tolerance: f64,
-) -> bool {
+fn agrees(points: &Points, outcomes: &[Option<Outcome>], a: usize, b: usize, tolerance: f64) -> bool {
     let (Some(oa), Some(ob)) = (&outcomes[a], &outcomes[b]) else {
         return false;
     };

@@ -170,16 +170,7 @@ pub fn correlate(
     settings: &Settings,
     observer: &dyn Observer,
 ) -> Result<Correlation, CorrelateError> {
-    correlate_at(
-        Level::new(),
-        false,
-        reference,
-        target,
-        points,
-        guess,
-        settings,
-        observer,
-    )
+    correlate_at(Level::new(), false, reference, target, points, guess, settings, observer)
 }
 
 /// As [`correlate`], with the scalar double-precision reference implementation of the inner loops:
@@ -195,26 +186,13 @@ pub fn correlate_scalar(
     settings: &Settings,
     observer: &dyn Observer,
 ) -> Result<Correlation, CorrelateError> {
-    correlate_at(
-        Level::new(),
-        true,
-        reference,
-        target,
-        points,
-        guess,
-        settings,
-        observer,
-    )
+    correlate_at(Level::new(), true, reference, target, points, guess, settings, observer)
 }
 
 /// Name of the SIMD instruction set that the kernels use on this machine.
 pub fn simd_level() -> String {
     let debug = format!("{:?}", Level::new());
-    debug
-        .split(['(', ' ', '{'])
-        .next()
-        .unwrap_or_default()
-        .to_owned()
+    debug.split(['(', ' ', '{']).next().unwrap_or_default().to_owned()
 }
 
 fn check(
@@ -245,35 +223,19 @@ fn check(
         Guess::Fft => {}
         Guess::Search { u, v } => {
             if ![u.0, u.1, v.0, v.1].into_iter().all(usable) {
-                return Err(CorrelateError::GuessValue {
-                    index: 0,
-                    limit: LIMIT,
-                });
+                return Err(CorrelateError::GuessValue { index: 0, limit: LIMIT });
             }
             let shifts = (u.1 - u.0 + 1.0) * (v.1 - v.0 + 1.0);
             if u.1 < u.0 || v.1 < v.0 || shifts > MAX_SHIFTS {
-                return Err(CorrelateError::SearchRange {
-                    u: *u,
-                    v: *v,
-                    limit: MAX_SHIFTS,
-                });
+                return Err(CorrelateError::SearchRange { u: *u, v: *v, limit: MAX_SHIFTS });
             }
         }
         Guess::Given(list) => {
             if list.len() != points.len() {
-                return Err(CorrelateError::GuessCount {
-                    guesses: list.len(),
-                    points: points.len(),
-                });
+                return Err(CorrelateError::GuessCount { guesses: list.len(), points: points.len() });
             }
-            if let Some(index) = list
-                .iter()
-                .position(|g| g.is_some_and(|d| !d.into_iter().all(usable)))
-            {
-                return Err(CorrelateError::GuessValue {
-                    index,
-                    limit: LIMIT,
-                });
+            if let Some(index) = list.iter().position(|g| g.is_some_and(|d| !d.into_iter().all(usable))) {
+                return Err(CorrelateError::GuessValue { index, limit: LIMIT });
             }
         }
     }
@@ -302,25 +264,12 @@ fn correlate_at(
     observer.stage(Stage::Solve);
     run.finish(seeds, guess);
     if observer.cancelled() {
-        return Err(CorrelateError::Cancelled {
-            done: run.done(),
-            total: points.len(),
-        });
+        return Err(CorrelateError::Cancelled { done: run.done(), total: points.len() });
     }
     let mut outcomes = run.outcomes;
     consistency::judge(&solver, points, &mut outcomes);
-    let points = outcomes
-        .iter()
-        .enumerate()
-        .map(|(k, o)| point(points, k, o.as_ref()))
-        .collect();
-    Ok(Correlation {
-        points,
-        timing: Timing {
-            init,
-            solve: start.elapsed() - init,
-        },
-    })
+    let points = outcomes.iter().enumerate().map(|(k, o)| point(points, k, o.as_ref())).collect();
+    Ok(Correlation { points, timing: Timing { init, solve: start.elapsed() - init } })
 }
 
 fn point(points: &Points, k: usize, outcome: Option<&Outcome>) -> Point {
@@ -349,12 +298,7 @@ fn point(points: &Points, k: usize, outcome: Option<&Outcome>) -> Point {
     let (_, offset) = points.centre(k);
     [p.u, p.v] = o.warp.at(offset[0], offset[1]);
     [p.sigma_u, p.sigma_v] = o.sigma;
-    let derivatives = |c: &[f64; 6]| {
-        [c[0], c[1], c[2], 2.0 * c[3], c[4], 2.0 * c[5]].map(|d| d as f32)
-    };
-    p.shape = ShapeParameters {
-        u: derivatives(&o.warp.0[0]),
-        v: derivatives(&o.warp.0[1]),
-    };
+    let derivatives = |c: &[f64; 6]| [c[0], c[1], c[2], 2.0 * c[3], c[4], 2.0 * c[5]].map(|d| d as f32);
+    p.shape = ShapeParameters { u: derivatives(&o.warp.0[0]), v: derivatives(&o.warp.0[1]) };
     p
 }

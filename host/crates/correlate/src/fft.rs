@@ -17,17 +17,11 @@ pub(crate) struct Window {
 impl Window {
     pub(crate) fn around(u: f64, v: f64, reach: i32) -> Self {
         let (u, v) = (u.round() as i32, v.round() as i32);
-        Self {
-            u: (u - reach, u + reach),
-            v: (v - reach, v + reach),
-        }
+        Self { u: (u - reach, u + reach), v: (v - reach, v + reach) }
     }
 
     fn size(&self) -> (usize, usize) {
-        (
-            (self.u.1 - self.u.0).max(0) as usize + 1,
-            (self.v.1 - self.v.0).max(0) as usize + 1,
-        )
+        ((self.u.1 - self.u.0).max(0) as usize + 1, (self.v.1 - self.v.0).max(0) as usize + 1)
     }
 }
 
@@ -126,10 +120,7 @@ pub(crate) struct Search {
 impl Search {
     pub(crate) fn new(layout: &Layout, window: &Window) -> Self {
         let size = window.size();
-        Self {
-            fft: Fft2::new(size.0 + layout.width - 1, size.1 + layout.width - 1),
-            size,
-        }
+        Self { fft: Fft2::new(size.0 + layout.width - 1, size.1 + layout.width - 1), size }
     }
 
     /// Best shift of the subset around (x, y) within a window of the planned size, and its ZNCC;
@@ -258,8 +249,7 @@ fn unpack(layout: &Layout, subset: &Subset, stride: usize, out: &mut [f32]) {
     let row_floats = layout.groups * LANES;
     let used = row_floats.min(layout.width);
     for d in 0..layout.width {
-        out[d * stride..d * stride + used]
-            .copy_from_slice(&subset.f[d * row_floats..d * row_floats + used]);
+        out[d * stride..d * stride + used].copy_from_slice(&subset.f[d * row_floats..d * row_floats + used]);
         for c in 0..layout.columns {
             let at = layout.width * row_floats + c * layout.column_groups() * LANES;
             out[d * stride + row_floats + c] = subset.f[at + d];
@@ -302,8 +292,7 @@ pub(crate) fn global_shifts(reference: &Image, target: &Image, count: usize) -> 
         let mut best = (f32::NEG_INFINITY, 0, 0);
         for v in -hv..=hv {
             for u in -hu..=hu {
-                let overlap =
-                    (w as i32 - u.abs()) as f32 * (h as i32 - v.abs()) as f32 / (w * h) as f32;
+                let overlap = (w as i32 - u.abs()) as f32 * (h as i32 - v.abs()) as f32 / (w * h) as f32;
                 // chance correlation grows as the root of the overlap
                 let z = map[place(u, v)] / overlap.max(0.1).sqrt();
                 if z > best.0 {
@@ -350,9 +339,8 @@ fn reduced(image: &Image, factor: usize) -> (Vec<f32>, usize, usize) {
         let (y0, y1) = (y.saturating_sub(4), (y + 5).min(h));
         for x in 0..w {
             let (x0, x1) = (x.saturating_sub(4), (x + 5).min(w));
-            let s = sum[y1 * stride + x1] + sum[y0 * stride + x0]
-                - sum[y0 * stride + x1]
-                - sum[y1 * stride + x0];
+            let s =
+                sum[y1 * stride + x1] + sum[y0 * stride + x0] - sum[y0 * stride + x1] - sum[y1 * stride + x0];
             out[y * w + x] -= (s / ((y1 - y0) * (x1 - x0)) as f64) as f32;
         }
     }

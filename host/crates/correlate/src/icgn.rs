@@ -57,14 +57,7 @@ pub(crate) struct Outcome {
 
 impl Outcome {
     fn failed(status: Status, warp: Warp) -> Self {
-        Self {
-            warp,
-            zncc: f64::NAN,
-            independent: f64::NAN,
-            iterations: 0,
-            status,
-            sigma: [f32::NAN; 2],
-        }
+        Self { warp, zncc: f64::NAN, independent: f64::NAN, iterations: 0, status, sigma: [f32::NAN; 2] }
     }
 }
 
@@ -209,8 +202,7 @@ impl<'a> Solver<'a> {
             // noise in the gradients makes the normal matrix look better than it is
             let excess = n * self.noise.gradient * noise_f / subset.products[2 * c][0];
             let honest = (1.0 - excess).max(0.2);
-            let variance =
-                residual * (own + through_gain * through_gain / subset.sff) / (honest * honest);
+            let variance = residual * (own + through_gain * through_gain / subset.sff) / (honest * honest);
             *o = variance.max(0.0).sqrt() as f32;
         }
         out
@@ -219,9 +211,7 @@ impl<'a> Solver<'a> {
 
 #[simd]
 fn load_translation<S: Simd>(s: S, solver: &Solver<'_>, scratch: &mut Scratch, x: i32, y: i32) {
-    scratch
-        .subset
-        .load::<S, 0>(s, &solver.layout, solver.reference, x, y);
+    scratch.subset.load::<S, 0>(s, &solver.layout, solver.reference, x, y);
 }
 
 #[simd]
@@ -244,9 +234,7 @@ fn iterate<S: Simd, const N: usize, const N1: usize, const O: usize>(
         if solver.scalar {
             scalar::load(&mut scratch.subset, layout, solver.reference, x, y, O);
         } else {
-            scratch
-                .subset
-                .load::<S, O>(s, layout, solver.reference, x, y);
+            scratch.subset.load::<S, O>(s, layout, solver.reference, x, y);
         }
         scratch.normal = Normal::new(&scratch.subset, m, n);
     }
@@ -267,9 +255,7 @@ fn iterate<S: Simd, const N: usize, const N1: usize, const O: usize>(
             out.status = Status::OutOfImage;
             break;
         }
-        let far = (warp.0[0][0] - guess.0[0][0])
-            .abs()
-            .max((warp.0[1][0] - guess.0[1][0]).abs());
+        let far = (warp.0[0][0] - guess.0[0][0]).abs().max((warp.0[1][0] - guess.0[1][0]).abs());
         if far > r {
             break;
         }
@@ -327,14 +313,7 @@ pub(crate) fn significant(sigmas: f64, independent: f64) -> f64 {
 }
 
 /// Increment in pixels, ZNCC before it, and the gain from deformed to reference grey levels.
-fn step(
-    subset: &Subset,
-    normal: &Normal,
-    sums: &Sums,
-    m: usize,
-    n: f64,
-    r: f64,
-) -> Option<(Warp, f64, f64)> {
+fn step(subset: &Subset, normal: &Normal, sums: &Sums, m: usize, n: f64, r: f64) -> Option<(Warp, f64, f64)> {
     let mean = sums.q / n;
     let sff = subset.sff;
     let sfg = sff - sums.fq;
@@ -367,10 +346,5 @@ fn step(
 /// Norm of an increment as a motion of the subset's edge.
 fn edge_motion(increment: &Warp, r: f64) -> f64 {
     let scale = [1.0, r, r, r * r, r * r, r * r];
-    increment
-        .0
-        .iter()
-        .flat_map(|c| c.iter().zip(&scale).map(|(a, s)| (a * s).powi(2)))
-        .sum::<f64>()
-        .sqrt()
+    increment.0.iter().flat_map(|c| c.iter().zip(&scale).map(|(a, s)| (a * s).powi(2))).sum::<f64>().sqrt()
 }

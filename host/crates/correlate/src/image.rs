@@ -48,18 +48,10 @@ fn check(width: usize, height: usize, found: usize) -> Result<(), ImageError> {
         return Err(ImageError::Empty { width, height });
     }
     if width > Image::MAX_SIDE || height > Image::MAX_SIDE {
-        return Err(ImageError::TooLarge {
-            width,
-            height,
-            limit: Image::MAX_SIDE,
-        });
+        return Err(ImageError::TooLarge { width, height, limit: Image::MAX_SIDE });
     }
     if width * height != found {
-        return Err(ImageError::Length {
-            width,
-            height,
-            found,
-        });
+        return Err(ImageError::Length { width, height, found });
     }
     Ok(())
 }
@@ -84,11 +76,7 @@ impl Image {
     pub fn from_u8(width: usize, height: usize, grey: &[u8]) -> Result<Self, ImageError> {
         check(width, height, grey.len())?;
         let data = grey.iter().map(|&g| f32::from(g)).collect();
-        Ok(Self {
-            width,
-            height,
-            data,
-        })
+        Ok(Self { width, height, data })
     }
 
     /// Image of 16-bit grey levels (`width * height` of them).
@@ -98,11 +86,7 @@ impl Image {
     pub fn from_u16(width: usize, height: usize, grey: &[u16]) -> Result<Self, ImageError> {
         check(width, height, grey.len())?;
         let data = grey.iter().map(|&g| f32::from(g)).collect();
-        Ok(Self {
-            width,
-            height,
-            data,
-        })
+        Ok(Self { width, height, data })
     }
 
     /// Image of single-precision grey levels (`width * height` of them).
@@ -112,16 +96,9 @@ impl Image {
     pub fn from_f32(width: usize, height: usize, grey: Vec<f32>) -> Result<Self, ImageError> {
         check(width, height, grey.len())?;
         if let Some(k) = grey.iter().position(|g| !g.is_finite()) {
-            return Err(ImageError::NotFinite {
-                x: k % width,
-                y: k / width,
-            });
+            return Err(ImageError::NotFinite { x: k % width, y: k / width });
         }
-        Ok(Self {
-            width,
-            height,
-            data: grey,
-        })
+        Ok(Self { width, height, data: grey })
     }
 
     /// Columns.
@@ -141,9 +118,7 @@ impl Image {
 
     /// Grey levels of row `y`, or nothing below the image.
     pub fn row(&self, y: usize) -> &[f32] {
-        self.data
-            .get(y * self.width..(y + 1) * self.width)
-            .unwrap_or(&[])
+        self.data.get(y * self.width..(y + 1) * self.width).unwrap_or(&[])
     }
 
     /// Mean grey level.
@@ -168,20 +143,12 @@ impl Mask {
     /// As [`Image::from_u8`].
     pub fn new(width: usize, height: usize, inside: Vec<bool>) -> Result<Self, ImageError> {
         check(width, height, inside.len())?;
-        Ok(Self {
-            width,
-            height,
-            inside,
-        })
+        Ok(Self { width, height, inside })
     }
 
     /// For pixels whose number is known to fit.
     pub(crate) fn from_parts(width: usize, height: usize, inside: Vec<bool>) -> Self {
-        Self {
-            width,
-            height,
-            inside,
-        }
+        Self { width, height, inside }
     }
 
     /// Columns.

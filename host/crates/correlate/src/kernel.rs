@@ -37,9 +37,7 @@ impl Sampling {
 
     /// Whether displacements change slowly enough along every row for [`sample_row`].
     fn gentle(&self, r: f64) -> bool {
-        [&self.u, &self.v]
-            .iter()
-            .all(|c| c[1].abs() + (2.0 * c[3].abs() + c[4].abs()) * r < GENTLE)
+        [&self.u, &self.v].iter().all(|c| c[1].abs() + (2.0 * c[3].abs() + c[4].abs()) * r < GENTLE)
     }
 }
 
@@ -128,9 +126,7 @@ fn interpolate_columns<S: Simd, const N: usize>(
     for (c, column) in out.chunks_exact_mut(column_floats).enumerate() {
         let i = (layout.groups * LANES + c) as i32 - ri;
         let xi = f64::from(i);
-        let line = |p: &[f64; 6]| {
-            [p[0] + (p[1] + p[3] * xi) * xi, p[2] + p[4] * xi, p[5]]
-        };
+        let line = |p: &[f64; 6]| [p[0] + (p[1] + p[3] * xi) * xi, p[2] + p[4] * xi, p[5]];
         let (u, v) = (line(&at.u), line(&at.v));
         for (k, o) in column.chunks_exact_mut(LANES).enumerate() {
             let first = k as i32 * LANES as i32 - ri;
@@ -223,10 +219,7 @@ fn accumulate<S: Simd, const O: usize>(
             sq = sq + q;
             sqq = q.mul_add(q, sqq);
             sfq = fv.mul_add(q, sfq);
-            let gq = [
-                q * V::from_slice(s, &subset.gx[at.clone()]),
-                q * V::from_slice(s, &subset.gy[at]),
-            ];
+            let gq = [q * V::from_slice(s, &subset.gx[at.clone()]), q * V::from_slice(s, &subset.gy[at])];
             for c in 0..2 {
                 b[c][0] = b[c][0] + gq[c];
                 if O >= 1 {
@@ -254,4 +247,137 @@ fn accumulate<S: Simd, const O: usize>(
         }
     }
     sums
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::image::Image;
+    use crate::plane;
+    use crate::prepared::Reference;
+    use crate::scalar;
+    use crate::settings::Interpolation;
+    use fearless_simd::{Level, dispatch};
+
+    /// A texture without symmetry.
+    fn texture() -> Image {
+        let (w, h) = (120, 110);
+        let grey = (0..w * h)
+            .map(|k| {
+                let (x, y) = ((k % w) as f32, (k / w) as f32);
+                let a = (0.61 * x + 0.2 * y).sin() + (0.47 * y - 0.33 * x).cos();
+                100.0 + 40.0 * a + 12.0 * (0.9 * x + 0.7 * y).sin()
+            })
+            .collect();
+        Image::from_f32(w, h, grey).unwrap()
+    }
+
+    fn compare(radius: usize, gradient: f64, order: usize, taps: usize) {
+        let kind = if taps == 6 { Interpolation::Quintic } else { Interpolation::Cubic };
+        let reference = Reference::new(texture());
+        let mut plane = Plane::default();
+        plane.load(reference.image(), 100.0);
+        let level = Level::new();
+        plane::coefficients(level, &mut plane, kind);
+        let layout = Layout::new(radius);
+        let (x, y) = (55, 52);
+        let second = if order == 2 { gradient / 100.0 } else { 0.0 };
+        let first = if order >= 1 { gradient } else { 0.0 };
+        let at = Sampling {
+            x: x + 2,
+            y: y - 1,
+            u: [0.37, first, -0.7 * first, second, -second, 0.5 * second],
+            v: [-0.21, 0.4 * first, -first, -second, 0.3 * second, second],
+            mean: 0.0,
+        };
+        let (mut fast, mut slow) = (Subset::default(), Subset::default());
+        scalar::load(&mut slow, &layout, &reference, x, y, order);
+        let at = Sampling { mean: (slow.mean - 100.0) as f32, ..at };
+        let mut warped = Vec::new();
+        macro_rules! go {
+            ($n:literal, $n1:literal, $o:literal) => {
+                dispatch!(level, s => {
+                    fast.load::<_, $o>(s, &layout, &reference, x, y);
+                    sweep::<_, $n, $n1, $o>(s, &layout, &fast, &plane, &at, &mut warped)
+                })
+            };
+        }
+        let sums = match (taps, order) {
+            (6, 0) => go!(6, 7, 0),
+            (6, 1) => go!(6, 7, 1),
+            (6, 2) => go!(6, 7, 2),
+            (4, 1) => go!(4, 5, 1),
+            _ => go!(4, 5, 2),
+        };
+        let what = format!("radius {radius} gradient {gradient} order {order} taps {taps}");
+        let expected = scalar::sweep(&layout, &slow, &plane, &at, taps, order);
+        // sums of n single-precision terms of either sign: relative to the sum of their sizes
+        let n = layout.count() as f64;
+        let q = (expected.qq / n).sqrt();
+        let g = (slow.products[0][0] / n).sqrt();
+        let close = |a: f64, b: f64, size: f64| {
+            assert!((a - b).abs() <= 2e-6 * n * size, "{what}: {a} {b}");
+        };
+        close(sums.q, expected.q, q);
+        close(sums.qq, expected.qq, q * q);
+        close(sums.fq, expected.fq, q * (slow.sff / n).sqrt());
+        close(fast.sff, slow.sff, slow.sff / n);
+        for c in 0..2 {
+            for k in 0..=monomial(0, order) {
+                close(sums.slopes[c][k], expected.slopes[c][k], q * g);
+                close(fast.slopes[c][k], slow.slopes[c][k], g);
+                close(fast.slopes_f[c][k], slow.slopes_f[c][k], g * (slow.sff / n).sqrt());
+            }
+        }
+        for c in 0..3 {
+            for k in 0..=monomial(0, 2 * order) {
+                close(fast.products[c][k], slow.products[c][k], g * g);
+            }
+        }
+    }
+
+    #[test]
+    fn sums_agree_with_the_scalar_reference() {
+        // 33 = 4·8 + 1, 25 = 3·8 + 1, 34 − 8 = 26 is even, 21 and 27 end in a partly filled group,
+        // 23 = 2·8 + 7, 41 = 5·8 + 1
+        for radius in [3, 5, 10, 11, 12, 13, 16, 20] {
+            for (order, taps) in [(0, 6), (1, 6), (2, 6), (1, 4), (2, 4)] {
+                // without carry, with carry, beyond the fast sampler
+                for gradient in [0.0, 0.004, 0.08, 0.3] {
+                    compare(radius, gradient, order, taps);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn splines_reproduce_polynomials() {
+        // a cubic polynomial is its own spline, away from the mirrored borders
+        let (w, h) = (160, 150);
+        let f = |x: f64, y: f64| {
+            let (x, y) = ((x - 80.0) / 40.0, (y - 75.0) / 40.0);
+            20.0 * x * x * x - 10.0 * x * y * y + 15.0 * y * y + 8.0 * x
+        };
+        let grey = (0..w * h).map(|k| f((k % w) as f64, (k / w) as f64) as f32).collect();
+        let image = Image::from_f32(w, h, grey).unwrap();
+        for (kind, taps) in [(Interpolation::Cubic, 4), (Interpolation::Quintic, 6)] {
+            let mut plane = Plane::default();
+            plane.load(&image, 0.0);
+            plane::coefficients(Level::new(), &mut plane, kind);
+            for k in 0..50 {
+                let (x, y) = (60.0 + 0.83 * f64::from(k), 60.0 + 0.57 * f64::from(k));
+                let g = scalar::sample(&plane, taps, x, y);
+                assert!((g - f(x, y)).abs() < 1e-4, "{kind:?} {x} {y}: {g} {}", f(x, y));
+            }
+        }
+        let reference = Reference::new(image);
+        let (x, y) = (90, 66);
+        let k = reference.gx.index(x, y);
+        let (x, y) = (f64::from(x), f64::from(y));
+        let e = 1e-4;
+        let dx = (f(x + e, y) - f(x - e, y)) / (2.0 * e);
+        let dy = (f(x, y + e) - f(x, y - e)) / (2.0 * e);
+        assert!((f64::from(reference.gx.data[k]) - dx).abs() < 1e-4);
+        assert!((f64::from(reference.gy.data[k]) - dy).abs() < 1e-4);
+    }
 }

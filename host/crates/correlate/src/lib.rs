@@ -30,8 +30,7 @@ mod subset;
 mod views;
 
 pub use correlate::{
-    CorrelateError, Correlation, Guess, Observer, Stage, Timing, correlate, correlate_scalar,
-    simd_level,
+    CorrelateError, Correlation, Guess, Observer, Stage, Timing, correlate, correlate_scalar, simd_level,
 };
 pub use image::{Image, ImageError, Mask};
 pub use point::{Point, ShapeParameters, Status};

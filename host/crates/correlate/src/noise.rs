@@ -68,9 +68,7 @@ impl NoiseGain {
         let mut energy = [0.0; STEPS + 1];
         for (i, e) in energy.iter_mut().enumerate() {
             let t = i as f64 / STEPS as f64;
-            *e = (-20..=20)
-                .map(|k| value(&c, n, t + f64::from(k)).powi(2))
-                .sum();
+            *e = (-20..=20).map(|k| value(&c, n, t + f64::from(k)).powi(2)).sum();
         }
         let c = cardinal(5);
         // β5′(x) = β4(x + ½) − β4(x − ½)

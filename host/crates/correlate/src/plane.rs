@@ -38,10 +38,7 @@ impl Plane {
     /// Takes the image's grey levels minus a constant, mirrored at the borders.
     pub(crate) fn load(&mut self, image: &Image, minus: f32) {
         let (w, h) = (image.width(), image.height());
-        self.resize(
-            (w + 2 * PAD).next_multiple_of(32),
-            (h + 2 * PAD).next_multiple_of(32),
-        );
+        self.resize((w + 2 * PAD).next_multiple_of(32), (h + 2 * PAD).next_multiple_of(32));
         for (y, out) in self.data.chunks_exact_mut(self.stride).enumerate() {
             let src = image.row(mirror(y, h));
             for (x, o) in out[..PAD].iter_mut().enumerate() {
@@ -158,8 +155,7 @@ fn filter_rows<S: Simd>(s: S, plane: &mut Plane, z: [f32; 2], gradient: bool) {
             for x in (0..stride).step_by(LANES) {
                 let mut m = [v(0.0); 8];
                 for i in 0..8 {
-                    m[i] =
-                        f32x8::from_slice(s, &plane.data[(y + 8 * h + i) * stride + x..][..LANES]);
+                    m[i] = f32x8::from_slice(s, &plane.data[(y + 8 * h + i) * stride + x..][..LANES]);
                 }
                 let m = transpose8(m);
                 for i in 0..8 {
@@ -203,8 +199,7 @@ fn filter_rows<S: Simd>(s: S, plane: &mut Plane, z: [f32; 2], gradient: bool) {
                     let b = f32x8::from_slice(s, &w[at + STRIP..at + STRIP + 8]);
                     let d = f32x8::from_slice(s, &w[at + 3 * STRIP..at + 3 * STRIP + 8]);
                     let e = f32x8::from_slice(s, &w[at + 4 * STRIP..at + 4 * STRIP + 8]);
-                    ((e - a) * k2 + (d - b) * k1)
-                        .store_slice(&mut slope[x * STRIP + at..][..LANES]);
+                    ((e - a) * k2 + (d - b) * k1).store_slice(&mut slope[x * STRIP + at..][..LANES]);
                 }
             }
         }
@@ -217,9 +212,7 @@ fn filter_rows<S: Simd>(s: S, plane: &mut Plane, z: [f32; 2], gradient: bool) {
                 }
                 let m = transpose8(m);
                 for i in 0..8 {
-                    m[i].store_slice(
-                        &mut plane.data[(y + 8 * h + i) * stride + x..][..LANES],
-                    );
+                    m[i].store_slice(&mut plane.data[(y + 8 * h + i) * stride + x..][..LANES]);
                 }
             }
         }
@@ -243,8 +236,7 @@ fn difference_columns<S: Simd>(s: S, plane: &mut Plane) {
                 w[k] = w[k + 1];
             }
             w[4] = f32x8::from_slice(s, &plane.data[(y + 2) * stride + x..][..LANES]);
-            ((w[4] - w[0]) * k2 + (w[3] - w[1]) * k1)
-                .store_slice(&mut plane.data[y * stride + x..][..LANES]);
+            ((w[4] - w[0]) * k2 + (w[3] - w[1]) * k1).store_slice(&mut plane.data[y * stride + x..][..LANES]);
         }
     }
 }

@@ -48,9 +48,7 @@ pub enum PointsError {
         height: usize,
     },
     /// The mask has another size than the image.
-    #[error(
-        "the mask has {mask_width}×{mask_height} pixels, the image {width}×{height}"
-    )]
+    #[error("the mask has {mask_width}×{mask_height} pixels, the image {width}×{height}")]
     MaskSize {
         /// Columns of the mask.
         mask_width: usize,
@@ -148,22 +146,13 @@ impl Points {
         if step == 0 {
             return Err(PointsError::ZeroStep);
         }
-        let all = Rectangle {
-            x: 0,
-            y: 0,
-            width,
-            height,
-        };
+        let all = Rectangle { x: 0, y: 0, width, height };
         let rect = roi.rectangle.unwrap_or(all);
         let fits = |start: usize, len: usize, size: usize| {
             len > 0 && start.checked_add(len).is_some_and(|end| end <= size)
         };
         if !fits(rect.x, rect.width, width) || !fits(rect.y, rect.height, height) {
-            return Err(PointsError::RoiOutside {
-                roi: rect,
-                width,
-                height,
-            });
+            return Err(PointsError::RoiOutside { roi: rect, width, height });
         }
         if let Some(m) = roi.mask
             && (m.width(), m.height()) != (width, height)
@@ -190,9 +179,8 @@ impl Points {
             for i in 0..columns {
                 let (x, y) = (x0 + i * step, y0 + j * step);
                 let whole = ((2 * r + 1) * (2 * r + 1)) as u32;
-                let inside = sums
-                    .as_ref()
-                    .is_none_or(|s| s.count(x - r, y - r, x + r + 1, y + r + 1) == whole);
+                let inside =
+                    sums.as_ref().is_none_or(|s| s.count(x - r, y - r, x + r + 1, y + r + 1) == whole);
                 if inside {
                     index[j * columns + i] = xy.len() as u32;
                     xy.push([x as f64, y as f64]);
@@ -202,14 +190,7 @@ impl Points {
         if xy.is_empty() {
             return Err(PointsError::Empty { subset });
         }
-        let grid = Grid {
-            x0,
-            y0,
-            step,
-            columns,
-            rows,
-            index,
-        };
+        let grid = Grid { x0, y0, step, columns, rows, index };
         let mut starts = vec![0u32];
         let mut neighbours = Vec::with_capacity(xy.len() * RING);
         for j in 0..rows {
@@ -225,12 +206,7 @@ impl Points {
                 starts.push(neighbours.len() as u32);
             }
         }
-        Ok(Self {
-            xy,
-            grid: Some(grid),
-            starts,
-            neighbours,
-        })
+        Ok(Self { xy, grid: Some(grid), starts, neighbours })
     }
 
     /// Scattered points at any sub-pixel positions. The subset of a point is centred at the nearest
@@ -244,24 +220,13 @@ impl Points {
     pub fn scattered(xy: Vec<[f64; 2]>) -> Result<Self, PointsError> {
         let limit = f64::from(1 << 20);
         if xy.len() > Self::MAX {
-            return Err(PointsError::TooMany {
-                count: xy.len(),
-                limit: Self::MAX,
-            });
+            return Err(PointsError::TooMany { count: xy.len(), limit: Self::MAX });
         }
-        if let Some(index) = xy
-            .iter()
-            .position(|p| !p.iter().all(|c| c.is_finite() && c.abs() <= limit))
-        {
+        if let Some(index) = xy.iter().position(|p| !p.iter().all(|c| c.is_finite() && c.abs() <= limit)) {
             return Err(PointsError::Position { index, limit });
         }
         let (starts, neighbours) = nearest(&xy);
-        Ok(Self {
-            xy,
-            grid: None,
-            starts,
-            neighbours,
-        })
+        Ok(Self { xy, grid: None, starts, neighbours })
     }
 
     /// Number of points.
@@ -299,18 +264,8 @@ impl Points {
 
 /// Nodes adjacent to (i, j), the four nearest first.
 fn around(i: usize, j: usize) -> impl Iterator<Item = (usize, usize)> {
-    const D: [(isize, isize); RING] = [
-        (0, -1),
-        (-1, 0),
-        (1, 0),
-        (0, 1),
-        (-1, -1),
-        (1, -1),
-        (-1, 1),
-        (1, 1),
-    ];
-    D.into_iter()
-        .filter_map(move |(a, b)| Some((i.checked_add_signed(a)?, j.checked_add_signed(b)?)))
+    const D: [(isize, isize); RING] = [(0, -1), (-1, 0), (1, 0), (0, 1), (-1, -1), (1, -1), (-1, 1), (1, 1)];
+    D.into_iter().filter_map(move |(a, b)| Some((i.checked_add_signed(a)?, j.checked_add_signed(b)?)))
 }
 
 /// The nearest points of each (up to eight, within three times the mean spacing) by a bucket grid,
@@ -329,11 +284,8 @@ fn nearest(xy: &[[f64; 2]]) -> (Vec<u32>, Vec<u32>) {
     }
     let area = ((hi[0] - lo[0]).max(1.0)) * ((hi[1] - lo[1]).max(1.0));
     // at most about two buckets per point, also where all points lie on one line
-    let cell = (area / n as f64)
-        .sqrt()
-        .max((hi[0] - lo[0]).max(hi[1] - lo[1]) / (2.0 * n as f64))
-        .max(1e-3)
-        * 1.5;
+    let cell =
+        (area / n as f64).sqrt().max((hi[0] - lo[0]).max(hi[1] - lo[1]) / (2.0 * n as f64)).max(1e-3) * 1.5;
     let columns = ((hi[0] - lo[0]) / cell) as usize + 1;
     let rows = ((hi[1] - lo[1]) / cell) as usize + 1;
     let bucket = |p: &[f64; 2]| {

@@ -60,12 +60,7 @@ fn gradients(image: &Image, gx: &mut Plane, gy: &mut Plane) {
 impl Target {
     /// Prepares a deformed image for the given interpolation.
     pub fn new(image: Image, interpolation: Interpolation) -> Self {
-        let mut target = Self {
-            offset: 0.0,
-            coefficients: Plane::default(),
-            interpolation,
-            image,
-        };
+        let mut target = Self { offset: 0.0, coefficients: Plane::default(), interpolation, image };
         target.prepare();
         target
     }

@@ -42,19 +42,8 @@ struct Task {
 }
 
 impl<'a> Propagation<'a> {
-    pub(crate) fn new(
-        solver: &'a Solver<'a>,
-        points: &'a Points,
-        observer: &'a dyn Observer,
-    ) -> Self {
-        Self {
-            solver,
-            points,
-            observer,
-            outcomes: vec![None; points.len()],
-            done: 0,
-            globals: Vec::new(),
-        }
+    pub(crate) fn new(solver: &'a Solver<'a>, points: &'a Points, observer: &'a dyn Observer) -> Self {
+        Self { solver, points, observer, outcomes: vec![None; points.len()], done: 0, globals: Vec::new() }
     }
 
     /// Points treated so far.
@@ -73,12 +62,7 @@ impl<'a> Propagation<'a> {
                 let tasks: Vec<Task> = list
                     .iter()
                     .enumerate()
-                    .filter_map(|(point, g)| {
-                        g.map(|[u, v]| Task {
-                            point,
-                            warp: Warp::translation(u, v),
-                        })
-                    })
+                    .filter_map(|(point, g)| g.map(|[u, v]| Task { point, warp: Warp::translation(u, v) }))
                     .collect();
                 self.solve(&tasks)
             }
@@ -100,10 +84,7 @@ impl<'a> Propagation<'a> {
                     return found;
                 }
                 let (w, h) = (a.width() as i32, a.height() as i32);
-                let whole = Window {
-                    u: (-w / 2, w / 2),
-                    v: (-h / 2, h / 2),
-                };
+                let whole = Window { u: (-w / 2, w / 2), v: (-h / 2, h / 2) };
                 let spread = seeds.len().div_ceil(WIDE_SEEDS).max(1);
                 let few: Vec<usize> = seeds.iter().copied().step_by(spread).collect();
                 self.search(&few, &[whole])
@@ -112,11 +93,8 @@ impl<'a> Propagation<'a> {
     }
 
     fn local_windows(&self) -> Vec<Window> {
-        let mut windows: Vec<Window> = self
-            .globals
-            .iter()
-            .map(|g| Window::around(g[0], g[1], LOCAL_REACH))
-            .collect();
+        let mut windows: Vec<Window> =
+            self.globals.iter().map(|g| Window::around(g[0], g[1], LOCAL_REACH)).collect();
         let zero = Window::around(0.0, 0.0, LOCAL_REACH);
         if !windows.contains(&zero) {
             windows.push(zero);
@@ -128,8 +106,7 @@ impl<'a> Propagation<'a> {
     fn seeds(&self) -> Vec<usize> {
         let xy = self.points.positions();
         let n = xy.len();
-        let side = ((n as f64 / POINTS_PER_SEED as f64).sqrt().ceil() as usize)
-            .clamp(2, MAX_SEEDS.isqrt());
+        let side = ((n as f64 / POINTS_PER_SEED as f64).sqrt().ceil() as usize).clamp(2, MAX_SEEDS.isqrt());
         let (mut lo, mut hi) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
         for p in xy {
             for c in 0..2 {
@@ -162,10 +139,7 @@ impl<'a> Propagation<'a> {
     /// none of many seeds succeeds there is nothing to be found, and the rest is not tried.
     fn search(&mut self, seeds: &[usize], windows: &[Window]) -> Vec<usize> {
         let mut accepted = Vec::new();
-        let searches: Vec<Search> = windows
-            .iter()
-            .map(|w| Search::new(&self.solver.layout, w))
-            .collect();
+        let searches: Vec<Search> = windows.iter().map(|w| Search::new(&self.solver.layout, w)).collect();
         let mut tried = 0;
         for batch in seeds.chunks(BATCH) {
             let mut left = batch.to_vec();
@@ -321,10 +295,7 @@ impl<'a> Propagation<'a> {
         let mut predictions = Vec::new();
         for k in 0..self.points.len() {
             let failed = self.outcomes[k].is_some_and(|o| {
-                matches!(
-                    o.status,
-                    Status::NotConverged | Status::LowCorrelation | Status::Distorted
-                )
+                matches!(o.status, Status::NotConverged | Status::LowCorrelation | Status::Distorted)
             });
             if !failed {
                 continue;

@@ -115,10 +115,7 @@ pub(crate) fn sample_row<S: Simd, const N: usize, const N1: usize, const O: usiz
     let fixed = |a: f64| (a * ONE) as i64;
     // value at the group's first pixel, its increment over a group, the increment's increment
     let (mut au, mut av) = (fixed(u[0]), fixed(v[0]));
-    let (mut bu, mut bv) = (
-        fixed(8.0 * u[1] + 64.0 * u[2]),
-        fixed(8.0 * v[1] + 64.0 * v[2]),
-    );
+    let (mut bu, mut bv) = (fixed(8.0 * u[1] + 64.0 * u[2]), fixed(8.0 * v[1] + 64.0 * v[2]));
     let (cu, cv) = (fixed(128.0 * u[2]), fixed(128.0 * v[2]));
     let (mut gu, mut gv) = (sp(u[1] as f32), sp(v[1] as f32));
     let (ku, kv) = (sp(u[2] as f32), sp(v[2] as f32));
@@ -146,8 +143,7 @@ pub(crate) fn sample_row<S: Simd, const N: usize, const N1: usize, const O: usiz
         (au, av) = (nu, nv);
         let origin = (y.wrapping_add(iv).wrapping_add(PAD as i32) as isize)
             .wrapping_mul(plane.stride as isize)
-            .wrapping_add(x.wrapping_add(iu).wrapping_add(PAD as i32) as isize)
-            as usize;
+            .wrapping_add(x.wrapping_add(iu).wrapping_add(PAD as i32) as isize) as usize;
         x += LANES as i32;
         let (carry_x, carry_y) = (ju != iu, jv != iv);
         let (limit, one) = (sp(0.5), sp(1.0));
@@ -208,11 +204,7 @@ pub(crate) fn sample_lanes<S: Simd, const N: usize>(
     let mut m = [zero; 8];
     for l in 0..LANES {
         let li = l as i32;
-        let o = clamped(
-            plane,
-            x + step_x * li + ix[l] as i32 - half,
-            y + step_y * li + iy[l] as i32 - half,
-        );
+        let o = clamped(plane, x + step_x * li + ix[l] as i32 - half, y + step_y * li + iy[l] as i32 - half);
         let Some(window) = plane.data.get(o..o + (N - 1) * stride + LANES) else {
             return zero;
         };

@@ -44,9 +44,8 @@ pub(crate) fn load(
     subset.gx = vec![0.0; total];
     subset.gy = vec![0.0; total];
     let n = layout.count() as f64;
-    let grey = |i: usize, d: usize| {
-        f64::from(reference.image.row((y - r) as usize + d)[(x - r) as usize + i])
-    };
+    let grey =
+        |i: usize, d: usize| f64::from(reference.image.row((y - r) as usize + d)[(x - r) as usize + i]);
     for d in 0..width {
         for i in 0..width {
             subset.mean += grey(i, d) / n;
@@ -62,10 +61,8 @@ pub(crate) fn load(
             subset.gx[k] = g[0];
             subset.gy[k] = g[1];
             subset.sff += f * f;
-            let (xi, eta) = (
-                (i as f64 - f64::from(r)) / f64::from(r),
-                (d as f64 - f64::from(r)) / f64::from(r),
-            );
+            let (xi, eta) =
+                ((i as f64 - f64::from(r)) / f64::from(r), (d as f64 - f64::from(r)) / f64::from(r));
             let g = [f64::from(g[0]), f64::from(g[1])];
             let p = powers(2 * order, xi, eta);
             for (c, product) in [g[0] * g[0], g[0] * g[1], g[1] * g[1]].iter().enumerate() {
@@ -87,11 +84,7 @@ pub(crate) fn load(
 fn basis(taps: usize, x: f64) -> f64 {
     let x = x.abs();
     if taps == 4 {
-        if x < 1.0 {
-            2.0 / 3.0 - x * x * (1.0 - 0.5 * x)
-        } else {
-            (2.0 - x).max(0.0).powi(3) / 6.0
-        }
+        if x < 1.0 { 2.0 / 3.0 - x * x * (1.0 - 0.5 * x) } else { (2.0 - x).max(0.0).powi(3) / 6.0 }
     } else {
         let p = |a: f64| (a - x).max(0.0).powi(5);
         (p(3.0) - 6.0 * p(2.0) + 15.0 * p(1.0)) / 120.0
@@ -131,12 +124,8 @@ pub(crate) fn sweep(
             let (xi, eta) = (i as f64 - r, d as f64 - r);
             let p = powers(2, xi, eta);
             let sum = |c: &[f64; 6]| -> f64 { c.iter().zip(&p).map(|(a, b)| a * b).sum() };
-            let g = sample(
-                plane,
-                taps,
-                f64::from(at.x) + xi + sum(&at.u),
-                f64::from(at.y) + eta + sum(&at.v),
-            );
+            let g =
+                sample(plane, taps, f64::from(at.x) + xi + sum(&at.u), f64::from(at.y) + eta + sum(&at.v));
             let k = place(layout, i, d);
             let f = f64::from(subset.f[k]);
             let q = f - (g - f64::from(at.mean));

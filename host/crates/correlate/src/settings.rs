@@ -128,16 +128,10 @@ impl Settings {
         };
         let max = Self::MAX_SUBSET;
         if !(min..=max).contains(&self.subset) {
-            return Err(SettingsError::SubsetRange {
-                subset: self.subset,
-                min,
-                max,
-            });
+            return Err(SettingsError::SubsetRange { subset: self.subset, min, max });
         }
         if self.subset.is_multiple_of(2) {
-            return Err(SettingsError::EvenSubset {
-                subset: self.subset,
-            });
+            return Err(SettingsError::EvenSubset { subset: self.subset });
         }
         let ranges = [
             ("tolerance", self.tolerance, 1e-6, 1.0),
@@ -150,12 +144,7 @@ impl Settings {
         ];
         for (name, value, min, max) in ranges {
             if !(min..=max).contains(&value) {
-                return Err(SettingsError::Range {
-                    name,
-                    value,
-                    min,
-                    max,
-                });
+                return Err(SettingsError::Range { name, value, min, max });
             }
         }
         Ok(())
@@ -168,11 +157,7 @@ impl Settings {
     pub fn validate_for(&self, width: usize, height: usize) -> Result<(), SettingsError> {
         self.validate()?;
         if self.subset > width || self.subset > height {
-            return Err(SettingsError::SubsetLargerThanImage {
-                subset: self.subset,
-                width,
-                height,
-            });
+            return Err(SettingsError::SubsetLargerThanImage { subset: self.subset, width, height });
         }
         Ok(())
     }

@@ -74,9 +74,8 @@ impl Warp {
 
     /// Displacement at (ξ, η) from the subset's centre.
     pub(crate) fn at(&self, xi: f64, eta: f64) -> [f64; 2] {
-        let f = |c: &Poly| {
-            c[0] + c[1] * xi + c[2] * eta + c[3] * xi * xi + c[4] * xi * eta + c[5] * eta * eta
-        };
+        let f =
+            |c: &Poly| c[0] + c[1] * xi + c[2] * eta + c[3] * xi * xi + c[4] * xi * eta + c[5] * eta * eta;
         [f(&self.0[0]), f(&self.0[1])]
     }
 
@@ -125,11 +124,7 @@ impl Warp {
             }
             (p, q)
         };
-        let (zx, zy) = apply(
-            &inv,
-            &[-du[0], 1.0, 0.0, 0.0, 0.0, 0.0],
-            &[-dv[0], 0.0, 1.0, 0.0, 0.0, 0.0],
-        );
+        let (zx, zy) = apply(&inv, &[-du[0], 1.0, 0.0, 0.0, 0.0, 0.0], &[-dv[0], 0.0, 1.0, 0.0, 0.0, 0.0]);
         let (mut x, mut y) = (zx, zy);
         if du[3..].iter().chain(&dv[3..]).any(|&q| q != 0.0) {
             let second = |c: &Poly| [0.0, 0.0, 0.0, c[3], c[4], c[5]];
@@ -177,21 +172,12 @@ mod tests {
     #[test]
     fn update_composes_with_the_inverse_of_the_increment() {
         // W(p) ∘ W(Δp)⁻¹ ∘ W(Δp) must be W(p) again: checked pointwise.
-        let p = Warp([
-            [1.3, 0.02, -0.01, 1e-4, -2e-4, 5e-5],
-            [-0.4, 0.005, 0.03, -1e-4, 1e-4, 2e-4],
-        ]);
+        let p = Warp([[1.3, 0.02, -0.01, 1e-4, -2e-4, 5e-5], [-0.4, 0.005, 0.03, -1e-4, 1e-4, 2e-4]]);
         let affine = Warp([[0.2, 0.01, 0.02, 0., 0., 0.], [-0.1, 0.015, -0.02, 0., 0., 0.]]);
-        let small = Warp([
-            [2e-3, 1e-4, -2e-4, 1e-5, 2e-5, -1e-5],
-            [-1e-3, 2e-4, 1e-4, -2e-5, 1e-5, 1e-5],
-        ]);
+        let small = Warp([[2e-3, 1e-4, -2e-4, 1e-5, 2e-5, -1e-5], [-1e-3, 2e-4, 1e-4, -2e-5, 1e-5, 1e-5]]);
         // Affine: exact. Quadratic: what is dropped is third degree in products of second-order
         // terms, 16³ · 2e-4 · 4e-5 ≈ 3e-5.
-        for (increment, base, tol) in [
-            (affine, p.restricted(Shape::Affine), 1e-12),
-            (small, p, 2e-4),
-        ] {
+        for (increment, base, tol) in [(affine, p.restricted(Shape::Affine), 1e-12), (small, p, 2e-4)] {
             let q = base.updated(&increment).unwrap();
             for (xi, eta) in [(0.0, 0.0), (16.0, -16.0), (-7.0, 12.0), (16.0, 16.0)] {
                 let d = increment.at(xi, eta);
@@ -206,10 +192,7 @@ mod tests {
 
     #[test]
     fn moved_field_is_the_same_field() {
-        let p = Warp([
-            [1.3, 0.02, -0.01, 1e-4, -2e-4, 5e-5],
-            [-0.4, 0.005, 0.03, -1e-4, 1e-4, 2e-4],
-        ]);
+        let p = Warp([[1.3, 0.02, -0.01, 1e-4, -2e-4, 5e-5], [-0.4, 0.005, 0.03, -1e-4, 1e-4, 2e-4]]);
         let q = p.moved(3.0, -5.0);
         let (a, b) = (p.at(4.0, 2.0), q.at(1.0, 7.0));
         assert!((a[0] - b[0]).abs() < 1e-12 && (a[1] - b[1]).abs() < 1e-12);

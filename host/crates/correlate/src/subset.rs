@@ -25,13 +25,7 @@ impl Layout {
         let width = 2 * radius + 1;
         let rest = width % LANES;
         if width > LANES && rest <= 2 {
-            Self {
-                radius,
-                width,
-                groups: width / LANES,
-                last: LANES,
-                columns: rest,
-            }
+            Self { radius, width, groups: width / LANES, last: LANES, columns: rest }
         } else {
             Self {
                 radius,

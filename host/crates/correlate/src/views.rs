@@ -121,11 +121,7 @@ impl Texture {
                 deviation[j * columns + i] = ((q - s * s / n) / n).max(0.0).sqrt();
             }
         }
-        Self {
-            columns,
-            rows,
-            deviation,
-        }
+        Self { columns, rows, deviation }
     }
 
     /// Threshold between background and specimens (Otsu on the logarithm) and the ratio of the
@@ -184,10 +180,7 @@ pub fn find_views(image: &Image) -> Result<Views, ViewsError> {
     let (columns, rows) = (texture.columns, texture.rows);
     let (threshold, found) = texture.threshold();
     if found < CONTRAST {
-        return Err(ViewsError::NoRegion {
-            found,
-            required: CONTRAST,
-        });
+        return Err(ViewsError::NoRegion { found, required: CONTRAST });
     }
     let mut lit: Vec<bool> = texture.deviation.iter().map(|&d| d > threshold).collect();
     erode(&mut lit, columns, rows, REACH);
@@ -198,9 +191,7 @@ pub fn find_views(image: &Image) -> Result<Views, ViewsError> {
         (MINOR * largest).max(DUST * (columns * rows) as f64)
     };
     let limit = least(&sizes);
-    let mut large: Vec<usize> = (0..sizes.len())
-        .filter(|&k| sizes[k] as f64 >= limit)
-        .collect();
+    let mut large: Vec<usize> = (0..sizes.len()).filter(|&k| sizes[k] as f64 >= limit).collect();
     if large.len() == 1 && split(&texture, &mut labels, large[0], sizes.len()) {
         large.push(sizes.len());
         let right = labels.iter().filter(|&&l| l == sizes.len()).count();
@@ -210,13 +201,8 @@ pub fn find_views(image: &Image) -> Result<Views, ViewsError> {
     large.sort_by(|&a, &b| sizes[b].cmp(&sizes[a]).then(a.cmp(&b)));
     let view = |label: usize| view(image, &labels, columns, label);
     match large[..] {
-        [] => Err(ViewsError::NoRegion {
-            found,
-            required: CONTRAST,
-        }),
-        [one] => Err(ViewsError::OneRegion {
-            bounds: view(one).bounds,
-        }),
+        [] => Err(ViewsError::NoRegion { found, required: CONTRAST }),
+        [one] => Err(ViewsError::OneRegion { bounds: view(one).bounds }),
         [a, b] => {
             let (mut minus, mut plus) = (view(a), view(b));
             let middle = |v: &View| v.bounds.x as f64 + 0.5 * (v.bounds.width as f64 - 1.0);
@@ -225,16 +211,11 @@ pub fn find_views(image: &Image) -> Result<Views, ViewsError> {
             }
             let centre = 0.5 * (width as f64 - 1.0);
             if middle(&minus) >= centre || middle(&plus) <= centre {
-                return Err(ViewsError::SameSide {
-                    centre,
-                    bounds: [minus.bounds, plus.bounds],
-                });
+                return Err(ViewsError::SameSide { centre, bounds: [minus.bounds, plus.bounds] });
             }
             Ok(Views { minus, plus })
         }
-        _ => Err(ViewsError::ManyRegions {
-            bounds: large.iter().map(|&k| view(k).bounds).collect(),
-        }),
+        _ => Err(ViewsError::ManyRegions { bounds: large.iter().map(|&k| view(k).bounds).collect() }),
     }
 }
 
@@ -245,9 +226,7 @@ fn erode(lit: &mut [bool], columns: usize, rows: usize, reach: usize) {
         for i in 0..columns {
             let whole = (j.saturating_sub(reach)..(j + reach + 1).min(rows)).all(|b| {
                 let line = &before[b * columns..(b + 1) * columns];
-                line[i.saturating_sub(reach)..(i + reach + 1).min(columns)]
-                    .iter()
-                    .all(|&l| l)
+                line[i.saturating_sub(reach)..(i + reach + 1).min(columns)].iter().all(|&l| l)
             });
             lit[j * columns + i] = whole;
         }
@@ -337,9 +316,7 @@ fn split(texture: &Texture, labels: &mut [usize], label: usize, fresh: usize) ->
         let middle = columns as f64 / 2.0;
         let valley = (from..to).min_by(|&a, &b| {
             let off = |c: usize| (c as f64 + 0.5 - middle).abs();
-            profile[a]
-                .total_cmp(&profile[b])
-                .then(off(a).total_cmp(&off(b)))
+            profile[a].total_cmp(&profile[b]).then(off(a).total_cmp(&off(b)))
         });
         let Some(valley) = valley else {
             return false;
@@ -349,11 +326,7 @@ fn split(texture: &Texture, labels: &mut [usize], label: usize, fresh: usize) ->
             for (k, l) in labels.iter_mut().enumerate() {
                 if *l == label && k % columns >= valley {
                     // the valley's own column belongs to neither
-                    *l = if k % columns == valley {
-                        usize::MAX
-                    } else {
-                        fresh
-                    };
+                    *l = if k % columns == valley { usize::MAX } else { fresh };
                 }
             }
             return true;
@@ -385,8 +358,5 @@ fn view(image: &Image, labels: &[usize], columns: usize, label: usize) -> View {
         width: x1.saturating_sub(x0),
         height: y1.saturating_sub(y0),
     };
-    View {
-        mask: Mask::from_parts(width, height, inside),
-        bounds,
-    }
+    View { mask: Mask::from_parts(width, height, inside), bounds }
 }

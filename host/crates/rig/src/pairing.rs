@@ -10,6 +10,9 @@
 //! ambiguous by nature; an uneven period, a pause, or the arrival of frames at the host
 //! ([`Arrival`]) makes them certain.
 //!
+//! What cannot be known: a foreign frame within the jitter of a trigger whose own frame was lost,
+//! and one or two foreign frames that are all that came and fit the triggers by chance.
+//!
 //! Nothing here depends on the order in which frames came.
 
 use std::collections::{HashMap, HashSet, VecDeque};
@@ -123,6 +126,8 @@ pub struct Pairing {
 
 /// Leading frames tried as extra: more than this many before the first trigger are not expected.
 const LEADING_EXTRAS: usize = 8;
+/// Pairs needed to believe an alignment that leaves frames unexplained.
+const LEAST_EVIDENCE: usize = 3;
 /// Pairs over which the rate is followed.
 const RATE_WINDOW: usize = 64;
 /// Frames after which an alignment that explains less than a quarter of them is given up.
@@ -374,8 +379,14 @@ impl Search<'_> {
                 self.merge(&mut leaders);
             }
         }
-        // Every frame could belong to any trigger: nothing is known of a single pair by itself.
-        leaders.pop().map_or_else(|| vec![Found::None; count], |a| a.found)
+        let mut found = leaders.pop().map_or_else(|| vec![Found::None; count], |a| a.found);
+        // Two frames among strangers may have a trigger interval between them by chance.
+        if best < count && best < LEAST_EVIDENCE {
+            for f in found.iter_mut().filter(|f| matches!(f, Found::One(_))) {
+                *f = Found::Many;
+            }
+        }
+        found
     }
 
     /// Folds equally good alignments into one; where they differ nothing is certain.

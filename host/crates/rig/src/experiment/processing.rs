@@ -44,9 +44,9 @@ pub struct Processing {
 impl Default for Processing {
     fn default() -> Self {
         Self {
-            subset: 33,
+            subset: 59,
             step: 10,
-            shape: Shape::Affine,
+            shape: Shape::Quadratic,
             interpolation: Interpolation::Quintic,
             decoder: Decoder::Ray,
             calibrate: true,
@@ -54,7 +54,7 @@ impl Default for Processing {
             threads: 0,
             noise: None,
             max_iterations: 30,
-            convergence: 1e-4,
+            convergence: 1e-3,
             min_zncc: 0.8,
             roi: None,
         }
