@@ -131,6 +131,12 @@ pub enum Error {
         /// Frames in it.
         frames: usize,
     },
+    /// A result that should be there is not.
+    #[error("{} is missing or damaged; run `daic process --fresh` on the dataset", path.display())]
+    NoResult {
+        /// The file.
+        path: PathBuf,
+    },
     /// A stored program that cannot be expanded.
     #[error("the dataset's program cannot be expanded: {0}")]
     Expand(#[from] crate::expand::ExpandError),

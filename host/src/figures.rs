@@ -67,12 +67,8 @@ pub enum Unit {
     Millimetre,
 }
 
-/// The surface, to be turned with the mouse.
-///
-/// # Errors
-/// If the figure cannot be drawn.
-pub fn surface_figure(height: &FloatMap, title: &str, caption: &str) -> Result<Figure, Error> {
-    let surface = HeightSurface {
+fn surface(height: &FloatMap, title: &str) -> HeightSurface {
+    HeightSurface {
         title: title.to_owned(),
         width: height.width as usize,
         height: height.height as usize,
@@ -81,13 +77,28 @@ pub fn surface_figure(height: &FloatMap, title: &str, caption: &str) -> Result<F
         quantity: "h".to_owned(),
         unit: "mm".to_owned(),
         scale: ColourScale::values(&height.data),
-    };
+    }
+}
+
+/// The surface, to be turned with the mouse.
+///
+/// # Errors
+/// If the figure cannot be drawn.
+pub fn surface_figure(height: &FloatMap, title: &str, caption: &str) -> Result<Figure, Error> {
     Ok(Figure {
         id: "surface".to_owned(),
         title: title.to_owned(),
         caption: caption.to_owned(),
-        body: surface.render_html()?,
+        body: surface(height, title).render_html()?,
     })
+}
+
+/// Writes the surface as a drawing that stands still.
+///
+/// # Errors
+/// If the figure cannot be drawn or written.
+pub fn write_surface_svg(path: &Path, height: &FloatMap, title: &str) -> Result<(), Error> {
+    Ok(atomic::write_bytes(path, surface(height, title).render_svg()?.as_str().as_bytes())?)
 }
 
 /// The frame with the two views as they were found.

@@ -1,5 +1,6 @@
 //! Runs `daic` and `hil-sim` as a user would.
 
+use crate::shared::root;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
@@ -11,18 +12,21 @@ fn target_directory() -> PathBuf {
     path
 }
 
-/// Path of a program of the workspace, built with the profile of the tests.
+/// Path of a program of the workspace, as `cargo test --workspace` builds it.
+///
+/// Cargo is asked to bring it up to date; within `cargo test --workspace` there is nothing to do.
 pub fn program(name: &str) -> PathBuf {
     static BUILT: OnceLock<()> = OnceLock::new();
     let directory = target_directory();
     BUILT.get_or_init(|| {
         let mut build = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-        build.args(["build", "--quiet", "--locked", "--package", "daic", "--package", "daic-hil-sim", "--bins"]);
+        // the same command, so the same features: anything else would build the dependencies anew
+        build.args(["test", "--workspace", "--no-run", "--quiet", "--locked"]);
         if directory.ends_with("release") {
             build.arg("--release");
         }
         build.arg("--target-dir").arg(directory.parent().expect("target/<profile>"));
-        build.current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/.."));
+        build.current_dir(root());
         let status = build.status().expect("cargo starts");
         assert!(status.success(), "building the programs: {status}");
     });

@@ -129,3 +129,39 @@ pub fn lint() -> Report {
     });
     report
 }
+
+/// Figures of README and docs, each from the demo's own results.
+const FIGURES: [&str; 6] = ["views", "surface", "h_mm", "u_mm", "w_mm", "timing"];
+
+pub fn figures() -> Report {
+    let mut report = Report::default();
+    let out = root().join("target/figures-demo");
+    report.step("the demo", || {
+        let mut command = cargo(&["run", "--release", "--locked", "--package", "daic", "--", "demo", "--out"]);
+        command.arg(&out);
+        outcome_of(command)
+    });
+    report.step("figures into docs/figures", || {
+        let to = root().join("docs/figures");
+        let copy = |name: &str| {
+            let file = format!("{name}.svg");
+            std::fs::copy(out.join("results/figures").join(&file), to.join(&file)).map(|_| ())
+        };
+        match std::fs::create_dir_all(&to).and_then(|()| FIGURES.iter().try_for_each(|name| copy(name))) {
+            Ok(()) => Outcome::Passed,
+            Err(error) => Outcome::Failed(error.to_string()),
+        }
+    });
+    report
+}
+
+pub fn bench() -> Report {
+    let mut report = Report::default();
+    report.step("speed of the correlation", || {
+        outcome_of(cargo(&["run", "--release", "--locked", "--package", "daic-correlate", "--example", "speed"]))
+    });
+    report.step("speed of the optics", || {
+        outcome_of(cargo(&["run", "--release", "--locked", "--package", "daic-optics", "--example", "decode_speed"]))
+    });
+    report
+}

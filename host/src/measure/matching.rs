@@ -157,7 +157,8 @@ impl Reference {
         settings.dic.validate_for(image.width(), image.height())?;
         progress.stage("finding the two views", 0);
         let found = find_views(&image)?;
-        let roi = Roi { rectangle: settings.roi, mask: Some(&found.minus.mask) };
+        let rectangle = settings.roi.or_else(|| centres(&found.minus.bounds, settings.dic.radius()));
+        let roi = Roi { rectangle, mask: Some(&found.minus.mask) };
         let points =
             Points::grid(image.width(), image.height(), settings.dic.subset, settings.step, &roi)?;
         let (u, v) = disparity(model, &found.minus.bounds, settings.height_mm)?;
@@ -230,6 +231,12 @@ impl Reference {
         }
         Ok(Tracks { points })
     }
+}
+
+/// Where the centres of subsets can lie that are wholly inside `view`; `None` where there is no room.
+fn centres(view: &Rectangle, radius: usize) -> Option<Rectangle> {
+    let (width, height) = (view.width.checked_sub(2 * radius)?, view.height.checked_sub(2 * radius)?);
+    (width > 0 && height > 0).then_some(Rectangle { x: view.x + radius, y: view.y + radius, width, height })
 }
 
 fn match_of(point: &Point) -> Match {

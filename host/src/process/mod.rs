@@ -8,7 +8,7 @@ mod report;
 mod summary;
 
 pub use summary::{
-    CalibratedParameter, CalibrationSummary, FieldSummary, FrameCounts, FrameSummary, ProfileSummary, Summary,
+    CalibratedParameter, CalibrationSummary, Check, FieldSummary, FrameCounts, FrameSummary, ProfileSummary, Summary,
 };
 
 use crate::error::Error;
@@ -27,6 +27,8 @@ use std::path::Path;
 pub const PROGRAM: &str = "program";
 /// Name of the manifest's field that holds the axes' steps at the begin of the run.
 pub const START_STEPS: &str = "start_steps";
+/// Folder of the figures, in the folder of the results.
+const FIGURES: &str = "figures";
 
 /// What `results/<reference>/result.json` holds.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
@@ -63,9 +65,8 @@ pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Proc
     let mut damage = contents.damage;
     damage.extend(dataset.events()?.damage);
     let paired: Vec<&FrameRecord> = contents.records.iter().filter(|f| f.verdict == Verdict::Paired).collect();
-    let first = paired.iter().find(|f| f.role == FrameRole::Reference).or(paired.first());
-    let reference_record: &FrameRecord =
-        first.ok_or_else(|| Error::NoPairedFrame { root: root.to_owned(), frames: contents.records.len() })?;
+    let reference_record =
+        reference_of(&contents.records).ok_or_else(|| Error::NoPairedFrame { root: root.to_owned(), frames: contents.records.len() })?;
 
     let settings = crate::settings::measure_settings(&experiment.processing);
     let mut run = Run {
@@ -108,9 +109,33 @@ pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Proc
     };
     dataset.write_summary(&summary)?;
     progress.stage("writing the report", 0);
-    let page = report::page(&dataset, &experiment, &summary, reference_record, &reference)?;
-    atomic::write_bytes(&dataset.report_path(), page.as_bytes())?;
+    write_report(&dataset, &summary, None)?;
     Ok(Processed { summary, damage, resumed })
+}
+
+/// Writes `report.html` of a dataset that has been measured, and its figures to `results/figures`;
+/// `checks` go to its top.
+///
+/// # Errors
+/// If results are missing or a figure cannot be drawn.
+pub fn write_report(dataset: &Dataset, summary: &Summary, checks: Option<&[Check]>) -> Result<(), Error> {
+    let experiment = Experiment::parse(&dataset.experiment_toml()?, &dataset.root().join("experiment.toml"))?;
+    let report = report::report(dataset, &experiment, summary, checks)?;
+    let figures = dataset.results().join(FIGURES);
+    for figure in report.sections.iter().flat_map(|s| &s.figures) {
+        // a figure that is more than a drawing lives on the page alone
+        if figure.body.as_str().starts_with("<svg") {
+            let path = figures.join(format!("{}.svg", figure.id));
+            atomic::write_bytes(&path, figure.body.as_str().as_bytes())?;
+        }
+    }
+    Ok(atomic::write_bytes(&dataset.report_path(), report.render()?.as_bytes())?)
+}
+
+/// The frame that displacements count from: the reference, or else the first that is paired.
+fn reference_of(records: &[FrameRecord]) -> Option<&FrameRecord> {
+    let paired = || records.iter().filter(|f| f.verdict == Verdict::Paired);
+    paired().find(|f| f.role == FrameRole::Reference).or_else(|| paired().next())
 }
 
 fn count(records: &[FrameRecord]) -> FrameCounts {

@@ -1,28 +1,36 @@
 //! `report.html` of a dataset.
 
-use super::{ReferenceResult, Summary, stored_program};
+use super::{Check, ReferenceResult, Summary, stored_program};
 use crate::error::Error;
 use crate::figures::{self, Unit};
 use crate::measure::Rectangle;
-use daic_dataset::{Dataset, FloatMap, FrameRecord};
+use daic_dataset::{Dataset, FloatMap};
 use daic_protocol::channels;
 use daic_report::{
-    AnalogTrace, Cell, DigitalLine, Figure, Report, Section, TableBlock, Timeline, plain, with_uncertainty,
+    AnalogTrace, Cell, DigitalLine, Figure, Report, Section, TableBlock, Timeline, Verdict, plain, with_uncertainty,
 };
 use daic_rig::experiment::Experiment;
 
 const AXES: [&str; 3] = ["u (right)", "v (down)", "w (towards the camera)"];
 
-/// Draws the page.
-pub fn page(
+/// The page, its figures drawn; the surface, which on the page can be turned, also as a file that stands still.
+pub fn report(
     dataset: &Dataset,
     experiment: &Experiment,
     summary: &Summary,
-    reference_record: &FrameRecord,
-    reference: &ReferenceResult,
-) -> Result<String, Error> {
+    checks: Option<&[Check]>,
+) -> Result<Report, Error> {
+    let records = dataset.frames()?.records;
+    let no_frame = || Error::NoPairedFrame { root: dataset.root().to_owned(), frames: records.len() };
+    let reference_record = super::reference_of(&records).ok_or_else(no_frame)?;
+    let result = dataset.frame_results(reference_record.id).join("result.json");
+    let reference: ReferenceResult = super::read_json(&result).ok_or(Error::NoResult { path: result })?;
     let mut sections = Vec::new();
+    if let Some(checks) = checks {
+        sections.push(Section { title: "Checks".to_owned(), tables: vec![check_table(checks)], ..Section::default() });
+    }
     let height = FloatMap::read_tiff(&dataset.frame_results(reference_record.id).join("h_mm.tif"))?;
+    figures::write_surface_svg(&dataset.results().join(super::FIGURES).join("surface.svg"), &height, "Surface")?;
     if let Some(last) = summary.measured.last() {
         let mut figures = Vec::new();
         let directory = dataset.frame_results(last.id);
@@ -94,17 +102,40 @@ pub fn page(
         });
     }
     let frames = &summary.frames;
-    let report = Report {
+    Ok(Report {
         title: "daic measurement".to_owned(),
         subtitle: format!(
             "{} frames paired with their strobes, {} missing, {} extra, {} ambiguous",
             frames.paired, frames.missing, frames.extra, frames.ambiguous
         ),
-        verdict: None,
+        verdict: checks.map(verdict),
         sections,
         provenance: provenance(dataset, experiment, summary),
+    })
+}
+
+fn verdict(checks: &[Check]) -> Verdict {
+    let failed = checks.iter().filter(|c| !c.passed).count();
+    let text = match failed {
+        0 => "What was commanded is what was measured.".to_owned(),
+        n => format!("{n} of {} checks failed.", checks.len()),
     };
-    Ok(report.render()?)
+    Verdict { pass: failed == 0, text }
+}
+
+fn check_table(checks: &[Check]) -> TableBlock {
+    let rows = checks
+        .iter()
+        .map(|c| {
+            let found = c.found.clone();
+            vec![
+                Cell::Text(c.name.clone()),
+                if c.passed { Cell::Pass(found) } else { Cell::Fail(found) },
+                Cell::Text(c.limit.clone()),
+            ]
+        })
+        .collect();
+    TableBlock { caption: String::new(), head: ["check", "found", "limit"].map(str::to_owned).to_vec(), rows }
 }
 
 fn move_table(summary: &Summary) -> TableBlock {

@@ -122,3 +122,16 @@ pub struct FieldSummary {
     /// Points with a result.
     pub ok: usize,
 }
+
+/// A check against what is known otherwise.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Check {
+    /// What.
+    pub name: String,
+    /// What was found.
+    pub found: String,
+    /// What it must not exceed, or must be.
+    pub limit: String,
+    /// Whether it held.
+    pub passed: bool,
+}

@@ -6,9 +6,11 @@ use crate::points::Points;
 
 /// Groups that confirm each other but cover less than this many subsets may be one chance match:
 /// overlapping subsets share their pixels.
-const GROUP_SUBSETS: f64 = 4.0;
+const GROUP_SUBSETS: f64 = 9.0;
 /// How much more significant than usual the best point of such a group must be.
 const GROUP_FACTOR: f64 = 1.5;
+/// ZNCC that suffices for it in any case.
+const GROUP_CAP: f64 = 0.96;
 
 /// Judges accepted points by their neighbours: those which are contradicted become
 /// [`Status::Inconsistent`], small groups that may be chance [`Status::LowCorrelation`].
@@ -80,7 +82,8 @@ fn chance_groups(
             }
             if let Some(o) = &outcomes[k] {
                 // above what chance alone would need
-                let bar = significant(GROUP_FACTOR * solver.settings.significance, o.independent);
+                let bar =
+                    significant(GROUP_FACTOR * solver.settings.significance, o.independent).min(GROUP_CAP);
                 best = best.max(o.zncc - bar);
             }
             for &c in points.neighbours(k) {

@@ -56,7 +56,7 @@ pub(crate) struct Outcome {
 }
 
 impl Outcome {
-    fn failed(status: Status, warp: Warp) -> Self {
+    pub(crate) fn failed(status: Status, warp: Warp) -> Self {
         Self { warp, zncc: f64::NAN, independent: f64::NAN, iterations: 0, status, sigma: [f32::NAN; 2] }
     }
 }
@@ -127,6 +127,13 @@ impl<'a> Solver<'a> {
         scratch.subset.centre = None;
     }
 
+    /// Whether the subset around (x, y), displaced like `warp`'s centre without deforming, clearly
+    /// leaves the deformed image.
+    pub(crate) fn leaves(&self, x: i32, y: i32, warp: &Warp) -> bool {
+        let moved = Warp::translation(warp.0[0][0], warp.0[1][0]);
+        !self.inside(x, y, &moved, 2.0)
+    }
+
     /// Whether the warped subset stays within `margin` pixels of the deformed image.
     fn inside(&self, x: i32, y: i32, warp: &Warp, margin: f64) -> bool {
         let r = self.layout.radius as f64;
@@ -143,7 +150,8 @@ impl<'a> Solver<'a> {
 
     /// ZNCC that unrelated speckles of the subset's size reach only with the chosen significance.
     fn threshold(&self, independent: f64) -> f64 {
-        significant(self.settings.significance, independent).max(self.settings.min_zncc)
+        // small subsets would need more than noise leaves them: their neighbours judge them
+        significant(self.settings.significance, independent).min(0.9).max(self.settings.min_zncc)
     }
 
     /// Number of independent speckles in the subset: two unrelated fields of correlation lengths s
@@ -199,10 +207,14 @@ impl<'a> Solver<'a> {
             b[c * m..c * m + m].copy_from_slice(&basis[..m]);
             let own = normal.quadratic_form(b);
             let through_gain: f64 = b.iter().zip(&coupled).map(|(a, e)| a * e).sum();
-            // noise in the gradients makes the normal matrix look better than it is
+            // Noise in the gradients makes the normal matrix look better than it is: with H the one
+            // seen and H₀ = H (1 − excess) the true one, the variance is s² (H₀ + H) / 2 / H₀². Only
+            // the deformed image's noise meets that of the gradients at random; the reference's own
+            // product f f_x sums to nothing.
             let excess = n * self.noise.gradient * noise_f / subset.products[2 * c][0];
             let honest = (1.0 - excess).max(0.2);
-            let variance = residual * (own + through_gain * through_gain / subset.sff) / (honest * honest);
+            let loss = 0.5 * (1.0 + honest) / (honest * honest);
+            let variance = residual * loss * (own + through_gain * through_gain / subset.sff);
             *o = variance.max(0.0).sqrt() as f32;
         }
         out
@@ -306,10 +318,9 @@ fn iterate<S: Simd, const N: usize, const N1: usize, const O: usize>(
     out
 }
 
-/// ZNCC that lies `sigmas` standard deviations above chance (Fisher's z). Small subsets would need
-/// more than noise leaves them: they are let through at 0.9 and judged by their neighbours.
+/// ZNCC that lies `sigmas` standard deviations above chance (Fisher's z).
 pub(crate) fn significant(sigmas: f64, independent: f64) -> f64 {
-    (sigmas / (independent - 3.0).max(1.0).sqrt()).tanh().min(0.9)
+    (sigmas / (independent - 3.0).max(1.0).sqrt()).tanh()
 }
 
 /// Increment in pixels, ZNCC before it, and the gain from deformed to reference grey levels.

@@ -176,12 +176,12 @@ fn accumulate<S: Simd, const O: usize>(
         for (((f, gx), gy), g) in groups {
             let fv = V::from_slice(s, f);
             let q = fv - (V::from_slice(s, g) - mean);
-            sq = sq + q;
+            sq += q;
             sqq = q.mul_add(q, sqq);
             sfq = fv.mul_add(q, sfq);
             let (qx, qy) = (q * V::from_slice(s, gx), q * V::from_slice(s, gy));
-            t[0][0] = t[0][0] + qx;
-            t[1][0] = t[1][0] + qy;
+            t[0][0] += qx;
+            t[1][0] += qy;
             if O >= 1 {
                 t[0][1] = qx.mul_add(e, t[0][1]);
                 t[1][1] = qy.mul_add(e, t[1][1]);
@@ -191,17 +191,17 @@ fn accumulate<S: Simd, const O: usize>(
                 t[0][2] = qx.mul_add(ee, t[0][2]);
                 t[1][2] = qy.mul_add(ee, t[1][2]);
             }
-            e = e + advance;
+            e += advance;
         }
         let n = sp((d as f32 - r) * rinv);
         for c in 0..2 {
-            b[c][0] = b[c][0] + t[c][0];
+            b[c][0] += t[c][0];
             if O >= 1 {
-                b[c][1] = b[c][1] + t[c][1];
+                b[c][1] += t[c][1];
                 b[c][2] = t[c][0].mul_add(n, b[c][2]);
             }
             if O == 2 {
-                b[c][3] = b[c][3] + t[c][2];
+                b[c][3] += t[c][2];
                 b[c][4] = t[c][1].mul_add(n, b[c][4]);
                 b[c][5] = t[c][0].mul_add(n * n, b[c][5]);
             }
@@ -216,16 +216,16 @@ fn accumulate<S: Simd, const O: usize>(
             let n = (lanes + sp(k as f32 - r)) * sp(rinv);
             let fv = V::from_slice(s, &subset.f[at.clone()]);
             let q = fv - (V::from_slice(s, &warped[at.clone()]) - mean);
-            sq = sq + q;
+            sq += q;
             sqq = q.mul_add(q, sqq);
             sfq = fv.mul_add(q, sfq);
             let gq = [q * V::from_slice(s, &subset.gx[at.clone()]), q * V::from_slice(s, &subset.gy[at])];
             for c in 0..2 {
-                b[c][0] = b[c][0] + gq[c];
+                b[c][0] += gq[c];
                 if O >= 1 {
                     let (ge, gn) = (gq[c] * e, gq[c] * n);
-                    b[c][1] = b[c][1] + ge;
-                    b[c][2] = b[c][2] + gn;
+                    b[c][1] += ge;
+                    b[c][2] += gn;
                     if O == 2 {
                         b[c][3] = ge.mul_add(e, b[c][3]);
                         b[c][4] = ge.mul_add(n, b[c][4]);

@@ -64,7 +64,7 @@ impl Plane {
 fn poles(kind: Interpolation) -> [f32; 2] {
     match kind {
         Interpolation::Cubic => [-0.267_949_2, 0.0],
-        Interpolation::Quintic => [-0.430_575_35, -0.043_096_288],
+        Interpolation::Quintic => [-0.430_575_35, -0.043_096_29],
     }
 }
 

@@ -268,8 +268,8 @@ fn around(i: usize, j: usize) -> impl Iterator<Item = (usize, usize)> {
     D.into_iter().filter_map(move |(a, b)| Some((i.checked_add_signed(a)?, j.checked_add_signed(b)?)))
 }
 
-/// The nearest points of each (up to eight, within three times the mean spacing) by a bucket grid,
-/// made symmetric by construction of the search only in the mean: ties go to the lower index.
+/// The nearest points of each (up to eight, within three times the mean spacing) by a bucket grid;
+/// ties go to the lower index.
 fn nearest(xy: &[[f64; 2]]) -> (Vec<u32>, Vec<u32>) {
     let n = xy.len();
     if n == 0 {

@@ -277,6 +277,7 @@ impl<'a> Propagation<'a> {
     /// Propagation, second attempts, and new seeds where propagation has not come.
     pub(crate) fn finish(&mut self, seeds: Vec<usize>, guess: &Guess<'_>) {
         self.spread(seeds);
+        self.leaving();
         for apart in [4, 1] {
             let fresh = self.reseed(apart, guess);
             if fresh.is_empty() {
@@ -286,6 +287,42 @@ impl<'a> Propagation<'a> {
         }
         let again = self.retry();
         self.spread(again);
+        self.leaving();
+    }
+
+    /// Names the points that have no place in one of the images: those whose subset leaves the
+    /// reference, and those that the displacement of the accepted points next to them carries out
+    /// of the deformed image.
+    fn leaving(&mut self) {
+        let mut front: Vec<usize> = Vec::new();
+        for k in 0..self.points.len() {
+            let ((x, y), _) = self.points.centre(k);
+            if !self.solver.fits(x, y) {
+                let nowhere = Warp::translation(0.0, 0.0);
+                self.outcomes[k] = Some(Outcome::failed(Status::OutOfImage, nowhere));
+            } else if self.accepted(k) {
+                front.push(k);
+            }
+        }
+        while !front.is_empty() {
+            let mut next = Vec::new();
+            for &k in &front {
+                let Some(from) = self.outcomes[k] else {
+                    continue;
+                };
+                for &c in self.points.neighbours(k) {
+                    let c = c as usize;
+                    let open = self.outcomes[c].is_none_or(|o| o.status == Status::NotConverged);
+                    let ((x, y), _) = self.points.centre(c);
+                    if open && self.solver.leaves(x, y, &from.warp) {
+                        self.outcomes[c] = Some(Outcome::failed(Status::OutOfImage, from.warp));
+                        next.push(c);
+                    }
+                }
+            }
+            front = next;
+        }
+        self.done = self.outcomes.iter().filter(|o| o.is_some()).count();
     }
 
     /// Points that failed beside accepted ones get a second attempt: from the median of what the

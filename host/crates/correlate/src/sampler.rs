@@ -132,8 +132,8 @@ pub(crate) fn sample_row<S: Simd, const N: usize, const N1: usize, const O: usiz
         if O == 2 {
             tx = ku.mul_add(lanes, gu).mul_add(lanes, tu);
             ty = kv.mul_add(lanes, gv).mul_add(lanes, tv);
-            gu = gu + hu;
-            gv = gv + hv;
+            gu += hu;
+            gv += hv;
             bu = bu.wrapping_add(cu);
             bv = bv.wrapping_add(cv);
         } else {

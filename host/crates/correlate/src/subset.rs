@@ -89,12 +89,12 @@ impl Subset {
         x: i32,
         y: i32,
     ) {
-        self.copy(layout, reference, x, y);
+        self.copy(s, layout, reference, x, y);
         let zero = V::splat(s, 0.0);
         let n = layout.count() as f64;
         let mut sum = zero;
         for c in self.f.chunks_exact(LANES) {
-            sum = sum + V::from_slice(s, c);
+            sum += V::from_slice(s, c);
         }
         // grey levels were copied relative to the centre pixel: the sum stays small
         let shift = f64::from(sum.reduce_sum()) / n;
@@ -105,7 +105,7 @@ impl Subset {
     }
 
     #[inline(always)]
-    fn copy(&mut self, layout: &Layout, reference: &Reference, x: i32, y: i32) {
+    fn copy<S: Simd>(&mut self, s: S, layout: &Layout, reference: &Reference, x: i32, y: i32) {
         let floats = layout.floats();
         if self.f.len() != floats {
             for v in [&mut self.f, &mut self.gx, &mut self.gy] {
@@ -120,15 +120,27 @@ impl Subset {
         self.mean = f64::from(centre);
         let row_floats = layout.groups * LANES;
         let used = (layout.groups - 1) * LANES + layout.last;
+        let level = V::splat(s, centre);
+        let whole = if layout.last == LANES { row_floats } else { row_floats - LANES };
         for d in 0..layout.width {
             let at = d * row_floats;
             let src = &image.row(y0 + d)[x0..x0 + layout.width];
-            for (o, &g) in self.f[at..at + used].iter_mut().zip(src) {
-                *o = g - centre;
-            }
             let o = reference.gx.index(x0 as i32, (y0 + d) as i32);
-            self.gx[at..at + used].copy_from_slice(&reference.gx.data[o..o + used]);
-            self.gy[at..at + used].copy_from_slice(&reference.gy.data[o..o + used]);
+            let (sx, sy) = (&reference.gx.data[o..], &reference.gy.data[o..]);
+            let f = &mut self.f[at..at + row_floats];
+            let gx = &mut self.gx[at..at + row_floats];
+            let gy = &mut self.gy[at..at + row_floats];
+            // by vectors: rows are too short for calls to memcpy
+            for k in (0..whole).step_by(LANES) {
+                (V::from_slice(s, &src[k..k + LANES]) - level).store_slice(&mut f[k..k + LANES]);
+                V::from_slice(s, &sx[k..k + LANES]).store_slice(&mut gx[k..k + LANES]);
+                V::from_slice(s, &sy[k..k + LANES]).store_slice(&mut gy[k..k + LANES]);
+            }
+            for k in whole..used {
+                f[k] = src[k] - centre;
+                gx[k] = sx[k];
+                gy[k] = sy[k];
+            }
         }
         for c in 0..layout.columns {
             let at = layout.width * row_floats + c * layout.column_groups() * LANES;
@@ -188,15 +200,15 @@ impl Subset {
                 let mut q = [xv, yv];
                 for i in 0..=2 * O {
                     for c in 0..3 {
-                        th[c][i] = th[c][i] + p[c];
-                        p[c] = p[c] * e;
+                        th[c][i] += p[c];
+                        p[c] *= e;
                     }
                 }
                 for i in 0..=O {
                     for c in 0..2 {
-                        tg[c][i] = tg[c][i] + q[c];
+                        tg[c][i] += q[c];
                         tf[c][i] = q[c].mul_add(fv, tf[c][i]);
-                        q[c] = q[c] * e;
+                        q[c] *= e;
                     }
                 }
             }
@@ -217,7 +229,7 @@ impl Subset {
                         }
                     }
                 }
-                power = power * eta;
+                power *= eta;
             }
         }
         let column_floats = layout.column_groups() * LANES;
@@ -242,13 +254,13 @@ impl Subset {
                             for c in 0..2 {
                                 let a = monomial(i, j);
                                 let t = qq[c] * m;
-                                g[c][a] = g[c][a] + t;
+                                g[c][a] += t;
                                 gf[c][a] = t.mul_add(fv, gf[c][a]);
                             }
                         }
-                        m = m * e;
+                        m *= e;
                     }
-                    power = power * eta;
+                    power *= eta;
                 }
             }
         }

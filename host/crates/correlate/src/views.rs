@@ -88,7 +88,10 @@ pub enum ViewsError {
 struct Texture {
     columns: usize,
     rows: usize,
+    /// Over the window around each block.
     deviation: Vec<f64>,
+    /// Over the block alone.
+    own: Vec<f64>,
 }
 
 impl Texture {
@@ -121,7 +124,9 @@ impl Texture {
                 deviation[j * columns + i] = ((q - s * s / n) / n).max(0.0).sqrt();
             }
         }
-        Self { columns, rows, deviation }
+        let n = (BLOCK * BLOCK) as f64;
+        let own = sums.iter().map(|(s, q)| ((q - s * s / n) / n).max(0.0).sqrt()).collect();
+        Self { columns, rows, deviation, own }
     }
 
     /// Threshold between background and specimens (Otsu on the logarithm) and the ratio of the
@@ -303,7 +308,7 @@ fn split(texture: &Texture, labels: &mut [usize], label: usize, fresh: usize) ->
     for (k, &l) in labels.iter().enumerate() {
         if l == label {
             count[k % columns] += 1.0;
-            strength[k % columns] += texture.deviation[k];
+            strength[k % columns] += texture.own[k];
         }
     }
     let median = |v: &[f64]| {
@@ -322,7 +327,11 @@ fn split(texture: &Texture, labels: &mut [usize], label: usize, fresh: usize) ->
             return false;
         };
         let sides = median(&profile[..valley]).min(median(&profile[valley + 1..]));
-        if profile[valley] <= depth * sides {
+        let right = count[valley + 1..].iter().sum::<f64>();
+        let left = count[..valley].iter().sum::<f64>();
+        // each view must hold a good part of the region
+        let balanced = left.min(right) >= 0.2 * (left + right);
+        if balanced && profile[valley] <= depth * sides {
             for (k, l) in labels.iter_mut().enumerate() {
                 if *l == label && k % columns >= valley {
                     // the valley's own column belongs to neither

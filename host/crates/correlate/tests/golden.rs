@@ -22,7 +22,8 @@ fn translation_at_the_noise_limit() {
         return;
     };
     // Cramér–Rao bounds: 6.5e-4 (quantisation) and 4.55e-3 px (noise of 2 grey levels)
-    for (noise, bias, scatter) in [("n0", 1.5e-4, 6.9e-4), ("n2", 1.5e-4, 4.8e-3)] {
+    // the mean over some 800 independent subsets is itself known to 4.5e-3 / √800 = 1.6e-4 at n2
+    for (noise, bias, scatter) in [("n0", 1.5e-4, 6.9e-4), ("n2", 4e-4, 4.8e-3)] {
         let c = correlate_case(&dir, noise, "t02", 5, Shape::Affine);
         assert_eq!(c.points.len(), 35721);
         assert_eq!(c.converged(), 35721);

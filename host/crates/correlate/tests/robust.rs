@@ -48,8 +48,9 @@ fn stripes_are_singular_or_refused() {
 
 #[test]
 fn unrelated_speckles_do_not_match() {
-    for (subset, shape) in
-        [(15, Shape::Affine), (21, Shape::Affine), (33, Shape::Affine), (33, Shape::Quadratic)]
+    // fifteen pixels hold some ten speckles: one in two hundred may look like another
+    for (subset, shape, per_mille) in
+        [(15, Shape::Affine, 5), (21, Shape::Affine, 1), (33, Shape::Affine, 1), (33, Shape::Quadratic, 1)]
     {
         let settings = Settings { subset, shape, ..Settings::default() };
         let points = Points::grid(N, N, subset, 2, &Roi::default()).unwrap();
@@ -58,7 +59,7 @@ fn unrelated_speckles_do_not_match() {
             ok += run(speckles(100 + seed), speckles(200 + seed), &points, &settings).converged();
         }
         println!("{subset} {shape:?}: {ok} of {}", 4 * points.len());
-        assert!(ok * 1000 <= 4 * points.len());
+        assert!(ok * 1000 <= 4 * per_mille * points.len());
     }
 }
 

@@ -1,4 +1,4 @@
-//! Times of decoding, projecting and calibrating: `cargo run -p daic-optics --example speed`.
+//! Times of decoding, projecting and calibrating: `cargo run -p daic-optics --example decode_speed`.
 
 use std::time::Instant;
 
