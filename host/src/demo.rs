@@ -24,7 +24,7 @@ const START_ERROR: f64 = 0.01;
 /// Limits of the demo's checks: measured minus commanded, RMS over the field (x, y, h).
 const MOVE_LIMIT_UM: [f64; 3] = [1.0, 1.0, 2.0];
 /// Measured height minus the specimen's formula, RMS over the field. Noise leaves half of this; a pitch
-/// that is 0.1 % wrong gives 110.
+/// that is 0.1 % wrong gives 150.
 const PROFILE_LIMIT_UM: f64 = 1.0;
 
 /// What `daic demo` is asked for.

@@ -19,10 +19,13 @@ fn help_names_every_command() {
         assert!(help.contains(&format!("\n  {command} ")), "{command} is not in\n{help}");
         let own = daic(&[command, "--help"]);
         assert!(own.status.success());
-        // every argument is explained
-        for line in text(&own.stdout).lines().filter(|line| line.trim_start().starts_with("--")) {
-            let explained = line.trim_start().split_once("  ").is_some_and(|(_, words)| !words.trim().is_empty());
-            assert!(explained, "{command}: {line}");
+        // every argument is explained, on its own line or the next
+        let own = text(&own.stdout);
+        let lines: Vec<&str> = own.lines().map(str::trim).collect();
+        for pair in lines.windows(2).filter(|pair| pair[0].starts_with("--")) {
+            let beside = pair[0].split_once("  ").is_some_and(|(_, words)| !words.trim().is_empty());
+            let below = !pair[1].is_empty() && !pair[1].starts_with('-');
+            assert!(beside || below, "{command}: {}", pair[0]);
         }
     }
 }

@@ -20,11 +20,11 @@ fn tree(program: &mut std::slice::Iter<'_, Instruction>) -> Vec<Node> {
     nodes
 }
 
-/// Largest t ≥ 0 with t² · a ≤ 2 · j · f²: ⌊√(2 j f²/a)⌋ without a root.
+/// Largest t < 2⁴⁸ (26 days) with t² · a ≤ 2 · j · f²: ⌊√(2 j f²/a)⌋ without a root.
 fn ramp(j: u64, a: u64) -> u64 {
     let f = 125_000_000u128;
     let bound = 2 * u128::from(j) * f * f;
-    let (mut low, mut high) = (0u128, 1u128 << 62);
+    let (mut low, mut high) = (0u128, 1u128 << 48);
     while low < high {
         let middle = (low + high).div_ceil(2);
         if middle * middle * u128::from(a) <= bound { low = middle } else { high = middle - 1 }

@@ -109,7 +109,7 @@ fn experiment(place: &Place, from: &str, to: &str) -> String {
 fn experiment_files() {
     let place = Place::new();
     let cases: [(&str, &str, &[&str]); 7] = [
-        ("seed = 1", "sede = 1", &["sede", "made.toml:9"]),
+        ("seed = 1", "sede = 1", &["sede", "made.toml:8:1"]),
         ("wavelength = \"633 nm\"", "wavelength = \"633 s\"", &["633 s", "nm"]),
         ("wavelength = \"633 nm\"", "wavelength = 633", &["unit"]),
         ("pinhole_to_grating = \"307 mm\"", "pinhole_to_grating = \"-307 mm\"", &["pinhole_to_grating", "-307"]),

@@ -129,9 +129,14 @@ impl Points {
     /// Most points in one run.
     pub const MAX: usize = 1 << 28;
 
+    /// Pixels at the image's edge that subsets of a grid stay clear of: there the spline rests on
+    /// mirrored grey levels, and points are several thousandths of a pixel off (on the golden
+    /// translation the outermost row had twice the scatter of the inner ones).
+    pub const BORDER: usize = 4;
+
     /// Regular grid in an image of `width` × `height` pixels. The first node is the first pixel of
-    /// the rectangle from which a subset fits into the image, i.e. at column
-    /// max(rectangle.x, subset / 2), and likewise for the row; nodes follow every `step` pixels.
+    /// the rectangle from which a subset stays [`Points::BORDER`] clear of the image's edge, i.e. at
+    /// column max(rectangle.x, subset / 2 + BORDER), and likewise for the row; nodes follow every `step` pixels.
     /// Nodes whose subset leaves the image or the mask are no points.
     ///
     /// # Errors
@@ -165,9 +170,10 @@ impl Points {
             });
         }
         let r = subset / 2;
+        let reach = r + Self::BORDER;
         let nodes = |start: usize, len: usize, size: usize| {
-            let first = start.max(r);
-            let end = (start + len).min(size.saturating_sub(r));
+            let first = start.max(reach);
+            let end = (start + len).min(size.saturating_sub(reach));
             (first, end.saturating_sub(first).div_ceil(step))
         };
         let (x0, columns) = nodes(rect.x, rect.width, width);

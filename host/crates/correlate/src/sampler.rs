@@ -63,10 +63,18 @@ fn convolve<S: Simd, const NX: usize, const NY: usize>(
     wy: &[V<S>; 7],
 ) -> Option<V<S>> {
     let stride = plane.stride;
-    let mut rows = plane.data.get(origin..)?.chunks(stride);
+    let mut rest = plane.data.get(origin..)?;
     let mut g = V::splat(s, 0.0);
     for j in 0..NY {
-        let row = rows.next()?.get(..2 * LANES)?;
+        // one comparison per row is all that bounds checking costs this way
+        let row = if j + 1 < NY {
+            let (row, below) = rest.split_at_checked(stride)?;
+            rest = below;
+            row
+        } else {
+            rest
+        };
+        let row = row.first_chunk::<{ 2 * LANES }>()?;
         let mut h = wx[0] * V::from_slice(s, &row[..LANES]);
         for i in 1..NX {
             h = wx[i].mul_add(V::from_slice(s, &row[i..i + LANES]), h);
