@@ -182,7 +182,11 @@ fn record(
 
 /// A real serial line where there are pseudo-terminals, else TCP on this machine.
 fn transport() -> Transport {
-    if cfg!(unix) { Transport::Pty { link: None } } else { Transport::Tcp { address: "127.0.0.1:0".to_owned() } }
+    if cfg!(unix) {
+        Transport::Pty { link: None }
+    } else {
+        Transport::Tcp { address: "127.0.0.1:0".to_owned() }
+    }
 }
 
 fn open(rig: &SimRig, experiment: &Experiment) -> Result<Link, Error> {

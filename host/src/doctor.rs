@@ -79,12 +79,24 @@ impl fmt::Display for Findings {
         let ports = if self.ports.is_empty() { "none listed".to_owned() } else { self.ports.join(", ") };
         writeln!(f, "serial ports   {ports}")?;
         writeln!(f, "cameras        {}", self.cameras.join(", "))?;
-        writeln!(f, "simulated rig  {}", if self.simulated_rig { "built in" } else { "left out of this build" })?;
+        writeln!(
+            f,
+            "simulated rig  {}",
+            if self.simulated_rig { "built in" } else { "left out of this build" }
+        )?;
         match &self.board {
             Some(b) => write!(
                 f,
                 "box            {} at {}, firmware {}, protocol {}, {} ticks/s; {} LEDs, {} cameras, {} axes, {} inputs",
-                b.name, b.port, b.firmware, b.protocol, b.tick_hz, b.lines[0], b.lines[1], b.lines[2], b.lines[3]
+                b.name,
+                b.port,
+                b.firmware,
+                b.protocol,
+                b.tick_hz,
+                b.lines[0],
+                b.lines[1],
+                b.lines[2],
+                b.lines[3]
             ),
             None => write!(f, "box            not asked (--port)"),
         }

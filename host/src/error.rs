@@ -13,7 +13,9 @@ pub enum Error {
     #[error("the optics cannot be used: {0}")]
     Optics(#[from] daic_optics::OpticsError),
     /// Neither one grating nor one for each view.
-    #[error("the optics state no complete grating: give `grating`, or both `grating_minus` and `grating_plus`")]
+    #[error(
+        "the optics state no complete grating: give `grating`, or both `grating_minus` and `grating_plus`"
+    )]
     Gratings,
     /// An image file.
     #[error(transparent)]
@@ -35,7 +37,9 @@ pub enum Error {
         height: u32,
     },
     /// A region of interest that the image does not hold.
-    #[error("the region of interest {x},{y},{w},{h} does not lie inside the image of {width}×{height} pixels: x + w must be at most {width}, y + h at most {height}")]
+    #[error(
+        "the region of interest {x},{y},{w},{h} does not lie inside the image of {width}×{height} pixels: x + w must be at most {width}, y + h at most {height}"
+    )]
     RoiOutside {
         /// Left.
         x: i64,
@@ -114,7 +118,9 @@ pub enum Error {
     #[error("the calibration failed: {0}")]
     Calibrate(#[from] daic_optics::calibrate::CalibrateError),
     /// No surface where the datum of heights is.
-    #[error("the calibration needs the surface near the optical axis for its height datum: {found} points lie within {radius_mm} mm of it, {needed} are needed; move the specimen or the principal point")]
+    #[error(
+        "the calibration needs the surface near the optical axis for its height datum: {found} points lie within {radius_mm} mm of it, {needed} are needed; move the specimen or the principal point"
+    )]
     NoAxisPoints {
         /// Points there.
         found: usize,

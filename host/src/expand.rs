@@ -162,7 +162,8 @@ pub fn expand(program: &[Instruction], position: [i32; 6]) -> Result<Edges, Expa
 
 /// Leaves out words that change nothing; of several at one tick the last counts.
 pub fn changes(words: &[(u64, u32)]) -> Edges {
-    let mut all = Expansion { edges: Vec::new(), now: 0, last: 0, word: channels::SAFE_WORD, position: [0; 6] };
+    let mut all =
+        Expansion { edges: Vec::new(), now: 0, last: 0, word: channels::SAFE_WORD, position: [0; 6] };
     for &(tick, word) in words {
         all.put(tick, word);
     }

@@ -3,7 +3,7 @@
 use crate::error::Error;
 use crate::measure::Rectangle;
 use daic_dataset::{FloatMap, GreyImage, atomic};
-use daic_report::{ColourScale, Figure, GridAxes, HeightSurface, Heatmap, Mark, Overlay};
+use daic_report::{ColourScale, Figure, GridAxes, Heatmap, HeightSurface, Mark, Overlay};
 use std::path::Path;
 
 fn axes(map: &FloatMap) -> GridAxes {

@@ -116,10 +116,15 @@ impl Camera for FolderCamera {
                 }
                 // a line that names no readable image is a frame that came with holes
                 self.stats.failed += 1;
-                return Err(FrameError::Incomplete { id: self.stats.completed + self.stats.failed, missing_bytes: 0 });
+                return Err(FrameError::Incomplete {
+                    id: self.stats.completed + self.stats.failed,
+                    missing_bytes: 0,
+                });
             }
             if Instant::now() >= until {
-                return Err(FrameError::Timeout { after_ms: u64::try_from(timeout.as_millis()).unwrap_or(u64::MAX) });
+                return Err(FrameError::Timeout {
+                    after_ms: u64::try_from(timeout.as_millis()).unwrap_or(u64::MAX),
+                });
             }
             std::thread::sleep(POLL);
         }

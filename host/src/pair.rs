@@ -92,7 +92,8 @@ pub fn correlate(
     let clock = Clock::start();
     let (a, b) = (image_of(reference)?, image_of(deformed)?);
     settings.validate_for(a.width(), a.height())?;
-    let points = Points::grid(a.width(), a.height(), settings.subset, step, &Roi { rectangle: roi, mask: None })?;
+    let points =
+        Points::grid(a.width(), a.height(), settings.subset, step, &Roi { rectangle: roi, mask: None })?;
     progress.stage("preparing the images", 0);
     let (subsets, target) = rayon::join(|| Reference::new(a), || Target::new(b, settings.interpolation));
     let prepare = clock.elapsed();

@@ -5,7 +5,8 @@ use crate::folder_camera::FolderCamera;
 use crate::process::{FrameCounts, PROGRAM, START_STEPS};
 use crate::progress::Progress;
 use daic_dataset::{
-    Dataset, EventRecord, Existing, FrameRecord, FrameRole, GreyImage, Manifest, Recording, StrobeRecord, Verdict,
+    Dataset, EventRecord, Existing, FrameRecord, FrameRole, GreyImage, Manifest, Recording, StrobeRecord,
+    Verdict,
 };
 use daic_protocol::message::{Event, EventKind};
 use daic_rig::acquire::{self, AcquireOptions, FrameSink, Run, SinkError};
@@ -171,7 +172,12 @@ fn manifest(
 }
 
 /// Writes the verdicts: frames that arrived are revised, triggers without a frame are added.
-fn judge(recording: &mut Recording, experiment: &Experiment, compiled: &Compiled, run: &Run) -> Result<(), Error> {
+fn judge(
+    recording: &mut Recording,
+    experiment: &Experiment,
+    compiled: &Compiled,
+    run: &Run,
+) -> Result<(), Error> {
     let mut records = recording.dataset().frames()?.records;
     let exposure_ns = experiment.rig.camera.exposure.ns().round() as u64;
     for (record, frame) in records.iter_mut().zip(&run.frames) {

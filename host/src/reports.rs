@@ -57,7 +57,10 @@ pub fn profile_page(
         caption: String::new(),
         head: vec!["quantity".to_owned(), "value".to_owned()],
         rows: vec![
-            row("points with a result", Cell::Number(format!("{} of {}", heights.count, profile.points.len()))),
+            row(
+                "points with a result",
+                Cell::Number(format!("{} of {}", heights.count, profile.points.len())),
+            ),
             row("mean height", number(heights.mean, "mm")),
             row("σ of a single height, RMS", number(sigmas.rms, "µm")),
             row("gap of the two rays, mean", number(gaps.mean, "µm")),
@@ -70,8 +73,14 @@ pub fn profile_page(
         plain(offset.mean, 1, "µm")
     )];
     if let Some(plane) = plane_of(&difference) {
-        let rest = spread(difference.iter().map(|d| d[2] - plane.offset - plane.slope_x * d[0] - plane.slope_y * d[1]));
-        text = vec![format!("{}, and {} RMS off after the best plane is taken out.", text[0], plain(rest.rms, 1, "µm"))];
+        let rest = spread(
+            difference.iter().map(|d| d[2] - plane.offset - plane.slope_x * d[0] - plane.slope_y * d[1]),
+        );
+        text = vec![format!(
+            "{}, and {} RMS off after the best plane is taken out.",
+            text[0],
+            plain(rest.rms, 1, "µm")
+        )];
     }
     let mut map = height.clone();
     "linear_minus_ray".clone_into(&mut map.name);
@@ -89,7 +98,13 @@ pub fn profile_page(
                 text: Vec::new(),
                 tables: vec![numbers],
                 figures: vec![
-                    figures::map_figure(&height, "Height", "h", Unit::Millimetre, "Height towards the camera over the reference plane, on the pixel grid of the −1 view.")?,
+                    figures::map_figure(
+                        &height,
+                        "Height",
+                        "h",
+                        Unit::Millimetre,
+                        "Height towards the camera over the reference plane, on the pixel grid of the −1 view.",
+                    )?,
                     figures::surface_figure(&height, "Surface", "Drag to turn, scroll to zoom.")?,
                 ],
             },
@@ -98,7 +113,13 @@ pub fn profile_page(
                 title: "What the linearised model makes of it".to_owned(),
                 text,
                 tables: Vec::new(),
-                figures: vec![figures::map_figure(&map, "Height by `linear` minus height here", "Δh", Unit::Micrometre, "")?],
+                figures: vec![figures::map_figure(
+                    &map,
+                    "Height by `linear` minus height here",
+                    "Δh",
+                    Unit::Micrometre,
+                    "",
+                )?],
             },
         ],
         provenance: provenance(decoder, settings),
@@ -159,7 +180,12 @@ pub fn displacement_page(
         subtitle: "Displacement of material points between two frames (Lagrangian)".to_owned(),
         verdict: None,
         sections: vec![
-            Section { title: "Displacement".to_owned(), text: Vec::new(), tables: vec![table], figures: maps },
+            Section {
+                title: "Displacement".to_owned(),
+                text: Vec::new(),
+                tables: vec![table],
+                figures: maps,
+            },
             Section {
                 title: "Shape of the reference".to_owned(),
                 text: Vec::new(),

@@ -136,7 +136,8 @@ impl Camera for SimCamera {
 
     /// The simulated camera is what the experiment made it: other settings are refused.
     fn configure(&mut self, settings: &CameraSettings) -> Result<CameraSettings, CameraError> {
-        let refuse = |setting, value: String, allowed: String| Err(CameraError::Setting { setting, value, allowed });
+        let refuse =
+            |setting, value: String, allowed: String| Err(CameraError::Setting { setting, value, allowed });
         if !settings.hardware_trigger {
             return refuse("hardware_trigger", "false".to_owned(), "true".to_owned());
         }

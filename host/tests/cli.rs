@@ -13,8 +13,18 @@ fn text(bytes: &[u8]) -> String {
 #[test]
 fn help_names_every_command() {
     let help = text(&daic(&["--help"]).stdout);
-    let commands =
-        ["demo", "simulate", "run", "process", "correlate", "profile", "displacement", "init", "schema", "doctor"];
+    let commands = [
+        "demo",
+        "simulate",
+        "run",
+        "process",
+        "correlate",
+        "profile",
+        "displacement",
+        "init",
+        "schema",
+        "doctor",
+    ];
     for command in commands {
         assert!(help.contains(&format!("\n  {command} ")), "{command} is not in\n{help}");
         let own = daic(&[command, "--help"]);

@@ -36,11 +36,8 @@ fn step_times(n: u64, v: u64, a: u64) -> Vec<u64> {
     let f = 125_000_000u128;
     let (v2, an) = (u128::from(v) * u128::from(v), u128::from(a) * u128::from(n));
     // a triangle of n steps lasts twice as long as it takes to speed up over half of them
-    let total = if v2 < an {
-        (f * (an + v2) / (u128::from(a) * u128::from(v))) as u64
-    } else {
-        ramp(2 * n, a)
-    };
+    let total =
+        if v2 < an { (f * (an + v2) / (u128::from(a) * u128::from(v))) as u64 } else { ramp(2 * n, a) };
     (1..=n)
         .map(|k| {
             let (done, left) = (u128::from(a * 2 * k), u128::from(a * 2 * (n - k)));
@@ -87,7 +84,12 @@ impl Lines {
                 }
                 Node::Leaf(Instruction::Move { axis, target, max_rate, acceleration, jerk }) => {
                     assert_eq!(*jerk, 0, "no definition for jerk-limited moves");
-                    self.travel(usize::from(*axis), i64::from(*target), u64::from(*max_rate), u64::from(*acceleration));
+                    self.travel(
+                        usize::from(*axis),
+                        i64::from(*target),
+                        u64::from(*max_rate),
+                        u64::from(*acceleration),
+                    );
                 }
                 Node::Leaf(Instruction::Stop) => self.stopped = true,
                 Node::Leaf(_) => {}

@@ -57,8 +57,9 @@ impl Run {
     /// # Panics
     /// If there is anything else on it.
     pub fn json(&self) -> serde_json::Value {
-        let value: serde_json::Value = serde_json::from_str(&self.stdout)
-            .unwrap_or_else(|error| panic!("stdout is not one JSON value ({error}):\n{}\n{}", self.stdout, self.stderr));
+        let value: serde_json::Value = serde_json::from_str(&self.stdout).unwrap_or_else(|error| {
+            panic!("stdout is not one JSON value ({error}):\n{}\n{}", self.stdout, self.stderr)
+        });
         assert!(value.is_object(), "stdout is not a JSON object: {}", self.stdout);
         value
     }
@@ -77,10 +78,7 @@ where
     I: IntoIterator<Item = S>,
     S: AsRef<std::ffi::OsStr>,
 {
-    let output = Command::new(program("daic"))
-        .args(arguments)
-        .current_dir(directory)
-        .output()
-        .expect("daic starts");
+    let output =
+        Command::new(program("daic")).args(arguments).current_dir(directory).output().expect("daic starts");
     Run::of(output)
 }

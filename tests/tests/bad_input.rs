@@ -78,7 +78,10 @@ fn image_files() {
 fn correlation_settings() {
     let place = Place::new();
     let with = |more: &[&'static str]| [&["correlate", "a.png", "b.png"], more].concat();
-    place.refused(&with(&["--roi", "100,0,40,40"]), &["region of interest", "100,0,40,40", "120×100".replace('×', " ").as_str()]);
+    place.refused(
+        &with(&["--roi", "100,0,40,40"]),
+        &["region of interest", "100,0,40,40", "120×100".replace('×', " ").as_str()],
+    );
     place.refused(&with(&["--roi", "-1,0,40,40"]), &["region of interest"]);
     place.refused(&with(&["--roi", "1,2,3"]), &["1,2,3", "X,Y,WIDTH,HEIGHT"]);
     place.refused(&with(&["--subset", "201"]), &["201", "does not fit"]);
@@ -112,7 +115,11 @@ fn experiment_files() {
         ("seed = 1", "sede = 1", &["sede", "made.toml:8:1"]),
         ("wavelength = \"633 nm\"", "wavelength = \"633 s\"", &["633 s", "nm"]),
         ("wavelength = \"633 nm\"", "wavelength = 633", &["unit"]),
-        ("pinhole_to_grating = \"307 mm\"", "pinhole_to_grating = \"-307 mm\"", &["pinhole_to_grating", "-307"]),
+        (
+            "pinhole_to_grating = \"307 mm\"",
+            "pinhole_to_grating = \"-307 mm\"",
+            &["pinhole_to_grating", "-307"],
+        ),
         ("lines = \"300 /mm\"", "lines = \"3000 /mm\"", &["grating", "wavelength"]),
         ("subset = ", "subset = 2", &["subset"]),
         ("exposure = \"5 ms\"", "exposure = \"1 ms\"", &["strobe"]),

@@ -62,7 +62,11 @@ fn golden_translations_reach_the_bound() {
         let Some(deformed) = shared(name, &format!("golden/dic/s1024_{noise}_t02.png")) else { return };
         let points = correlate(&reference, &deformed, &THIRTY_THREE);
         let (bias, scatter) = (mean(&points.u) - 0.2, std(&points.u));
-        eprintln!("{noise}_t02: bias {bias:.2e} px, std {scatter:.3e} px, {} of {}", points.u.len(), points.all);
+        eprintln!(
+            "{noise}_t02: bias {bias:.2e} px, std {scatter:.3e} px, {} of {}",
+            points.u.len(),
+            points.all
+        );
         assert!(bias.abs() <= bias_limit, "{noise}: bias {bias}");
         assert!(scatter <= std_limit, "{noise}: std {scatter}");
         assert!(mean(&points.v).abs() <= bias_limit && std(&points.v) <= std_limit);
@@ -98,7 +102,8 @@ fn challenge_14_waves() {
     let name = "challenge_14_waves";
     let Some(folder) = shared(name, "data/dic_challenge_14") else { return };
     let deformed = folder.join("Sample14 L5 Amp0.1b.tif");
-    let points = correlate(&folder.join("Sample14 Reference.tif"), &deformed, &["--subset", "21", "--step", "10"]);
+    let points =
+        correlate(&folder.join("Sample14 Reference.tif"), &deformed, &["--subset", "21", "--step", "10"]);
     let truth: Vec<f64> = std::fs::read_to_string(folder.join("command.csv"))
         .expect("command.csv")
         .lines()
@@ -140,7 +145,11 @@ fn challenge_12_plate_with_a_hole() {
         let deformed = folder.join(format!("oht_cfrp_{frame:02}.tiff"));
         let points = correlate(&reference, &deformed, &["--subset", "33", "--step", "5"]);
         let outside = outside_of_specimen(&points);
-        eprintln!("frame {frame:02}: {} of {} ok, {outside} of them outside the specimen", points.u.len(), points.all);
+        eprintln!(
+            "frame {frame:02}: {} of {} ok, {outside} of them outside the specimen",
+            points.u.len(),
+            points.all
+        );
         let inside = inside_nodes();
         let found = points
             .x

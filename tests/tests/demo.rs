@@ -128,8 +128,13 @@ fn played_edges_are_those_of_an_independent_expansion() {
 #[test]
 fn every_strobe_lies_inside_its_exposure() {
     let dataset = default_demo().dataset();
-    let paired: Vec<_> =
-        dataset.frames().expect("frames").records.into_iter().filter(|f| f.verdict == Verdict::Paired).collect();
+    let paired: Vec<_> = dataset
+        .frames()
+        .expect("frames")
+        .records
+        .into_iter()
+        .filter(|f| f.verdict == Verdict::Paired)
+        .collect();
     assert_eq!(paired.len(), 7);
     for frame in &paired {
         let [strobe] = &frame.strobes[..] else { panic!("{}: {} strobes", frame.name, frame.strobes.len()) };
@@ -145,7 +150,11 @@ fn the_summary_follows_from_the_dataset() {
     let demo = default_demo();
     let summary = demo.run.json();
     let dataset = demo.dataset();
-    assert_eq!(dataset.summary::<Value>().expect("readable"), Some(summary.clone()), "summary.json is the answer");
+    assert_eq!(
+        dataset.summary::<Value>().expect("readable"),
+        Some(summary.clone()),
+        "summary.json is the answer"
+    );
 
     let frames = dataset.frames().expect("frames").records;
     let of = |role| frames.iter().find(|f| f.role == role).expect("such a frame");
@@ -159,7 +168,8 @@ fn the_summary_follows_from_the_dataset() {
     let status = table.texts("status", &path).expect("status");
     for (i, name) in ["u_mm", "v_mm", "w_mm"].into_iter().enumerate() {
         let values = table.numbers(name, &path).expect("numbers");
-        let ok: Vec<f64> = values.iter().zip(&status).filter(|(_, s)| *s == "ok").map(|(v, _)| 1e3 * v).collect();
+        let ok: Vec<f64> =
+            values.iter().zip(&status).filter(|(_, s)| *s == "ok").map(|(v, _)| 1e3 * v).collect();
         let n = ok.len() as f64;
         let mean = ok.iter().sum::<f64>() / n;
         let rms = (ok.iter().map(|v| (v - commanded[i]).powi(2)).sum::<f64>() / n).sqrt();
@@ -239,7 +249,8 @@ fn the_report_needs_nothing_else() {
     for outside in ["src=\"http", "href=\"http", "url(http", "@import"] {
         assert!(!page.contains(outside), "{outside}");
     }
-    for part in ["Displacement u", "Displacement w", "Height", "Surface", "Timing", "Calibration", "+1 view"] {
+    for part in ["Displacement u", "Displacement w", "Height", "Surface", "Timing", "Calibration", "+1 view"]
+    {
         assert!(page.contains(part), "{part} is missing");
     }
 }

@@ -40,13 +40,26 @@ fn the_cylinder_is_right_without_registration() {
     let folder = TempDir::new().expect("folder");
     let mut errors = Vec::new();
     for decoder in ["ray", "closed", "linear"] {
-        let arguments =
-            ["profile", "--quiet", "--json", "--optics", &optics(), &frame, "--decoder", decoder, "--out", decoder];
+        let arguments = [
+            "profile",
+            "--quiet",
+            "--json",
+            "--optics",
+            &optics(),
+            &frame,
+            "--decoder",
+            decoder,
+            "--out",
+            decoder,
+        ];
         let answer = daic(folder.path(), arguments).expect_code(0).json();
         let points = columns(&folder.path().join(decoder).join("points.csv"), ["x_mm", "h_mm", "sigma_h_mm"]);
         let error = 1e3 * rms(points.iter().map(|[x, h, _]| h - cylinder(*x)));
         let predicted = 1e3 * rms(points.iter().map(|p| p[2]));
-        eprintln!("{decoder}: {error:.3} µm RMS over {} points, σ_h {predicted:.3} µm; {answer}", points.len());
+        eprintln!(
+            "{decoder}: {error:.3} µm RMS over {} points, σ_h {predicted:.3} µm; {answer}",
+            points.len()
+        );
         assert!(points.len() > 20_000);
         errors.push(error);
     }

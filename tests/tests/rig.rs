@@ -60,14 +60,27 @@ fn a_run_over_a_serial_line_is_recorded_and_measured() {
     // the plane stands at h = 0
     let text = std::fs::read_to_string(folder.path().join("experiment.toml")).expect("written");
     assert!(text.contains("axis_height = \"1 mm\""));
-    std::fs::write(folder.path().join("experiment.toml"), text.replace("axis_height = \"1 mm\"", "axis_height = \"0 mm\""))
-        .expect("written");
+    std::fs::write(
+        folder.path().join("experiment.toml"),
+        text.replace("axis_height = \"1 mm\"", "axis_height = \"0 mm\""),
+    )
+    .expect("written");
     std::fs::write(folder.path().join("scene.toml"), SCENE).expect("written");
     let sim = Box::start(folder.path(), &["--pty", "--scene", "scene.toml", "--frames", "camera"]);
     let doctor = daic(folder.path(), ["doctor", "--json", "--port", &sim.port]).expect_code(0).json();
     assert_eq!(doctor["board"]["tick_hz"], 125_000_000);
-    let arguments =
-        ["run", "experiment.toml", "--quiet", "--json", "--port", &sim.port, "--frames", "camera", "--out", "data"];
+    let arguments = [
+        "run",
+        "experiment.toml",
+        "--quiet",
+        "--json",
+        "--port",
+        &sim.port,
+        "--frames",
+        "camera",
+        "--out",
+        "data",
+    ];
     let answer = daic(folder.path(), arguments).expect_code(0).json();
     assert_eq!(answer["frames"]["paired"], 7, "{answer}");
     assert_eq!(answer["frames"]["missing"], 0);
@@ -86,12 +99,17 @@ fn lost_and_doubled_frames_are_told() {
     experiment(folder.path());
     let scene = format!("{SCENE}\n[faults]\ndrop_frames = [2]\nduplicate_frames = [4]\n");
     std::fs::write(folder.path().join("scene.toml"), scene).expect("written");
-    let arguments = ["simulate", "experiment.toml", "--scene", "scene.toml", "--quiet", "--json", "--out", "data"];
+    let arguments =
+        ["simulate", "experiment.toml", "--scene", "scene.toml", "--quiet", "--json", "--out", "data"];
     let answer = daic(folder.path(), arguments).expect_code(0).json();
     assert_eq!(answer["frames"]["paired"], 6, "{answer}");
     assert_eq!(answer["frames"]["missing"], 1, "{answer}");
-    assert_eq!(answer["frames"]["extra"].as_u64().expect("n") + answer["frames"]["ambiguous"].as_u64().expect("n"), 1);
-    let records = Dataset::open(&folder.path().join("data")).expect("dataset").frames().expect("frames").records;
+    assert_eq!(
+        answer["frames"]["extra"].as_u64().expect("n") + answer["frames"]["ambiguous"].as_u64().expect("n"),
+        1
+    );
+    let records =
+        Dataset::open(&folder.path().join("data")).expect("dataset").frames().expect("frames").records;
     let missing: Vec<_> = records.iter().filter(|f| f.verdict == Verdict::Missing).collect();
     // the third trigger of the template
     assert_eq!(missing.len(), 1);
@@ -135,10 +153,13 @@ fn a_busy_port() {
 
 #[test]
 fn a_box_that_resets_or_falls_silent_in_the_middle() {
-    for (fault, words) in [("reset_after_requests = 9", &["reset"][..]), ("silent_after_requests = 9", &["answer"][..])] {
+    for (fault, words) in
+        [("reset_after_requests = 9", &["reset"][..]), ("silent_after_requests = 9", &["answer"][..])]
+    {
         let folder = TempDir::new().expect("folder");
         experiment(folder.path());
-        std::fs::write(folder.path().join("scene.toml"), format!("{SCENE}\n[faults]\n{fault}\n")).expect("written");
+        std::fs::write(folder.path().join("scene.toml"), format!("{SCENE}\n[faults]\n{fault}\n"))
+            .expect("written");
         let arguments = ["simulate", "experiment.toml", "--scene", "scene.toml", "--quiet", "--out", "data"];
         rig_error(daic(folder.path(), arguments), words);
         // what was recorded until then is a dataset that reads

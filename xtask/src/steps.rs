@@ -95,7 +95,17 @@ fn thumb() -> Outcome {
         ));
     }
     let environment = String::from_utf8_lossy(&output.stdout);
-    let mut build = cargo(&["build", "--locked", "--release", "--target", "thumbv6m-none-eabi", "-p", "daic-protocol", "-p", "daic-firmware"]);
+    let mut build = cargo(&[
+        "build",
+        "--locked",
+        "--release",
+        "--target",
+        "thumbv6m-none-eabi",
+        "-p",
+        "daic-protocol",
+        "-p",
+        "daic-firmware",
+    ]);
     // a directory of its own: the compiler may be another than the one that built the rest
     build.env("CARGO_TARGET_DIR", root().join("target/thumb-build"));
     for line in environment.lines() {
@@ -119,13 +129,11 @@ pub fn lint() -> Report {
         command.env("RUSTDOCFLAGS", "-D warnings");
         outcome_of(command)
     });
-    report.step("licences, sources and bans (cargo-deny)", || {
-        match cargo(&["deny", "--version"]).output() {
-            Ok(output) if output.status.success() => {
-                outcome_of(cargo(&["deny", "--offline", "check", "licenses", "bans", "sources"]))
-            }
-            _ => Outcome::NotRun("cargo-deny is not installed (`cargo install cargo-deny`)".into()),
+    report.step("licences, sources and bans (cargo-deny)", || match cargo(&["deny", "--version"]).output() {
+        Ok(output) if output.status.success() => {
+            outcome_of(cargo(&["deny", "--offline", "check", "licenses", "bans", "sources"]))
         }
+        _ => Outcome::NotRun("cargo-deny is not installed (`cargo install cargo-deny`)".into()),
     });
     report
 }
@@ -137,7 +145,8 @@ pub fn figures() -> Report {
     let mut report = Report::default();
     let out = root().join("target/figures-demo");
     report.step("the demo", || {
-        let mut command = cargo(&["run", "--release", "--locked", "--package", "daic", "--", "demo", "--out"]);
+        let mut command =
+            cargo(&["run", "--release", "--locked", "--package", "daic", "--", "demo", "--out"]);
         command.arg(&out);
         outcome_of(command)
     });
@@ -158,10 +167,26 @@ pub fn figures() -> Report {
 pub fn bench() -> Report {
     let mut report = Report::default();
     report.step("speed of the correlation", || {
-        outcome_of(cargo(&["run", "--release", "--locked", "--package", "daic-correlate", "--example", "speed"]))
+        outcome_of(cargo(&[
+            "run",
+            "--release",
+            "--locked",
+            "--package",
+            "daic-correlate",
+            "--example",
+            "speed",
+        ]))
     });
     report.step("speed of the optics", || {
-        outcome_of(cargo(&["run", "--release", "--locked", "--package", "daic-optics", "--example", "decode_speed"]))
+        outcome_of(cargo(&[
+            "run",
+            "--release",
+            "--locked",
+            "--package",
+            "daic-optics",
+            "--example",
+            "decode_speed",
+        ]))
     });
     report
 }

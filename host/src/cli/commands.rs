@@ -1,8 +1,8 @@
 //! What each command does: arguments to facade calls, results to an answer.
 
 use super::arguments::{
-    CorrelateArgs, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, InitArgs, InterpolationArg, ProcessArgs,
-    ProfileArgs, Roi, RunArgs, ShapeArg,
+    CorrelateArgs, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, InitArgs, InterpolationArg,
+    ProcessArgs, ProfileArgs, Roi, RunArgs, ShapeArg,
 };
 #[cfg(feature = "sim")]
 use super::arguments::{DemoArgs, SimulateArgs};
@@ -30,7 +30,12 @@ pub fn demo(arguments: &DemoArgs, output: &Output) -> Result<Answer, Error> {
     let m = &summary.measurement;
     let rows = [m.commanded_um, m.measured_um, m.rms_um, m.sigma_um];
     let [commanded, measured, rms, sigma] = rows.map(|r| r.unwrap_or([f64::NAN; 3]));
-    writeln!(text, "{:<8}{:>14}{:>14}{:>16}{:>14}", "µm", "commanded", "measured", "difference RMS", "σ of a point").ok();
+    writeln!(
+        text,
+        "{:<8}{:>14}{:>14}{:>16}{:>14}",
+        "µm", "commanded", "measured", "difference RMS", "σ of a point"
+    )
+    .ok();
     for (i, axis) in ["x", "y", "h"].into_iter().enumerate() {
         let values = format!("{:>14.3}{:>14.3}{:>16.3}{:>14.3}", commanded[i], measured[i], rms[i], sigma[i]);
         writeln!(text, "{axis:<8}{values}").ok();
@@ -57,7 +62,8 @@ pub fn simulate(arguments: &SimulateArgs, output: &Output) -> Result<Answer, Err
 pub fn run(arguments: &RunArgs, output: &Output) -> Result<Answer, Error> {
     let experiment = Experiment::load(&arguments.experiment)?;
     let port = arguments.port.clone().unwrap_or_else(|| experiment.rig.port.clone());
-    let recorded = daic::recording::run_at_port(&experiment, &port, &arguments.frames, &arguments.out, output)?;
+    let recorded =
+        daic::recording::run_at_port(&experiment, &port, &arguments.frames, &arguments.out, output)?;
     recording_answer(&arguments.out, &recorded)
 }
 
@@ -103,9 +109,7 @@ pub fn correlate(arguments: &CorrelateArgs, output: &Output) -> Result<Answer, E
     if let (Some(path), Some(write)) = (&arguments.out, writer) {
         write(&table, path)?;
     }
-    let seconds = |s: fn(&daic::usage::Seconds) -> f64| {
-        json!({ "init": s(&found.init), "prepare": s(&found.prepare), "solve": s(&found.solve), "total": s(&found.total) })
-    };
+    let seconds = |s: fn(&daic::usage::Seconds) -> f64| json!({ "init": s(&found.init), "prepare": s(&found.prepare), "solve": s(&found.solve), "total": s(&found.total) });
     let json = json!({
         "points": found.points.len(),
         "converged": found.converged(),
@@ -258,10 +262,8 @@ pub fn init(arguments: &InitArgs) -> Result<Answer, Error> {
 
 pub fn schema() -> Result<Answer, Error> {
     let text = experiment::experiment_schema();
-    let json = serde_json::from_str(&text).map_err(|source| Error::Unwritable {
-        path: "the schema".into(),
-        reason: source.to_string(),
-    })?;
+    let json = serde_json::from_str(&text)
+        .map_err(|source| Error::Unwritable { path: "the schema".into(), reason: source.to_string() })?;
     Ok(Answer::new(json, text))
 }
 

@@ -107,7 +107,8 @@ pub fn displacement(
         .map(|(matched, track)| {
             let reference = point(model, decoder, matched);
             let nan = [f64::NAN; 3];
-            let without = |status| DisplacementPoint { reference, displacement_mm: nan, sigma_mm: nan, status };
+            let without =
+                |status| DisplacementPoint { reference, displacement_mm: nan, sigma_mm: nan, status };
             if !reference.status.is_ok() {
                 return without(reference.status);
             }

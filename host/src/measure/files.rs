@@ -78,7 +78,8 @@ fn write(directory: &Path, table: &Table, maps: &[FloatMap]) -> Result<(), Error
 
 /// The height at the nodes of the grid; NaN where it does not count.
 pub fn height_map(profile: &Profile) -> FloatMap {
-    let height = |k: usize| if profile.points[k].status.is_ok() { profile.points[k].point_mm[2] } else { f64::NAN };
+    let height =
+        |k: usize| if profile.points[k].status.is_ok() { profile.points[k].point_mm[2] } else { f64::NAN };
     float_map(&profile.grid, "h_mm", profile.grid.spread_over_nodes(height))
 }
 

@@ -159,8 +159,7 @@ impl Reference {
         let found = find_views(&image)?;
         let rectangle = settings.roi.or_else(|| centres(&found.minus.bounds, settings.dic.radius()));
         let roi = Roi { rectangle, mask: Some(&found.minus.mask) };
-        let points =
-            Points::grid(image.width(), image.height(), settings.dic.subset, settings.step, &roi)?;
+        let points = Points::grid(image.width(), image.height(), settings.dic.subset, settings.step, &roi)?;
         let (u, v) = disparity(model, &found.minus.bounds, settings.height_mm)?;
         let target = Target::new(image.clone(), settings.dic.interpolation);
         let subsets = Subsets::new(image);
@@ -195,7 +194,14 @@ impl Reference {
         let target = Target::new(image_of(frame)?, self.settings.dic.interpolation);
         let run = |points: &Points, name| -> Result<Correlation, Error> {
             let observer = Named(name, progress);
-            Ok(daic_correlate::correlate(&self.subsets, &target, points, &Guess::Fft, &self.settings.dic, &observer)?)
+            Ok(daic_correlate::correlate(
+                &self.subsets,
+                &target,
+                points,
+                &Guess::Fft,
+                &self.settings.dic,
+                &observer,
+            )?)
         };
         let minus = run(&self.points, "tracking in the −1 view")?;
         let matched: Vec<usize> =

@@ -10,7 +10,9 @@ mod matching;
 mod statistics;
 
 pub use decode::{Displacement, DisplacementPoint, Profile, ProfilePoint, displacement, profile};
-pub use files::{displacement_maps, displacement_table, height_map, profile_table, write_displacement, write_profile};
+pub use files::{
+    displacement_maps, displacement_table, height_map, profile_table, write_displacement, write_profile,
+};
 pub use matching::{Match, Rectangle, Reference, Settings, Track, Tracks, image_of};
 pub use statistics::{Plane, Spread, plane_of, spread};
 

@@ -138,11 +138,7 @@ fn height_on_axis(points: &[[f64; 3]]) -> Option<(f64, f64)> {
 }
 
 /// How the uncertainty of F and s carries over to the height on the axis, and with it to d.
-fn datum_sigma(
-    found: &daic_optics::calibrate::Calibration,
-    model: &OpticalModel,
-    height_sigma: f64,
-) -> f64 {
+fn datum_sigma(found: &daic_optics::calibrate::Calibration, model: &OpticalModel, height_sigma: f64) -> f64 {
     let axis = Vector3::zeros();
     let pair = (model.project(daic_optics::View::Minus, axis), model.project(daic_optics::View::Plus, axis));
     let (Ok(minus_px), Ok(plus_px)) = pair else { return f64::NAN };

@@ -8,7 +8,8 @@ mod report;
 mod summary;
 
 pub use summary::{
-    CalibratedParameter, CalibrationSummary, Check, FieldSummary, FrameCounts, FrameSummary, ProfileSummary, Summary,
+    CalibratedParameter, CalibrationSummary, Check, FieldSummary, FrameCounts, FrameSummary, ProfileSummary,
+    Summary,
 };
 
 use crate::error::Error;
@@ -64,9 +65,10 @@ pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Proc
     let contents = dataset.frames()?;
     let mut damage = contents.damage;
     damage.extend(dataset.events()?.damage);
-    let paired: Vec<&FrameRecord> = contents.records.iter().filter(|f| f.verdict == Verdict::Paired).collect();
-    let reference_record =
-        reference_of(&contents.records).ok_or_else(|| Error::NoPairedFrame { root: root.to_owned(), frames: contents.records.len() })?;
+    let paired: Vec<&FrameRecord> =
+        contents.records.iter().filter(|f| f.verdict == Verdict::Paired).collect();
+    let reference_record = reference_of(&contents.records)
+        .ok_or_else(|| Error::NoPairedFrame { root: root.to_owned(), frames: contents.records.len() })?;
 
     let settings = crate::settings::measure_settings(&experiment.processing);
     let mut run = Run {
@@ -183,7 +185,8 @@ impl Run<'_> {
     fn key(&self, optics: &Optics, records: &[&FrameRecord]) -> Result<String, Error> {
         let files: Vec<_> =
             records.iter().filter_map(|r| Some(self.dataset.root().join(r.file.as_ref()?))).collect();
-        let settings = (&self.experiment.processing, optics, records.iter().map(|r| r.commanded_um).collect::<Vec<_>>());
+        let settings =
+            (&self.experiment.processing, optics, records.iter().map(|r| r.commanded_um).collect::<Vec<_>>());
         Ok(result_key(env!("CARGO_PKG_VERSION"), &settings, &files)?)
     }
 
@@ -319,7 +322,8 @@ fn frame_summary(
     displacement: &Displacement,
 ) -> FrameSummary {
     let ok = || displacement.points.iter().filter(|p| p.status.is_ok());
-    let against = |c: [f64; 3]| [0, 1, 2].map(|i| spread(ok().map(|p| 1e3 * p.displacement_mm[i] - c[i])).rms);
+    let against =
+        |c: [f64; 3]| [0, 1, 2].map(|i| spread(ok().map(|p| 1e3 * p.displacement_mm[i] - c[i])).rms);
     FrameSummary {
         id: record.id,
         name: record.name.clone(),
@@ -344,10 +348,8 @@ fn edge_error(dataset: &Dataset) -> Result<(Option<u64>, usize), Error> {
 fn stored_program(dataset: &Dataset) -> Option<(Vec<Instruction>, [i32; 6])> {
     let extra = &dataset.manifest().extra;
     let text = extra.get(PROGRAM)?.as_str()?;
-    let bytes: Option<Vec<u8>> = (0..text.len())
-        .step_by(2)
-        .map(|i| u8::from_str_radix(text.get(i..i + 2)?, 16).ok())
-        .collect();
+    let bytes: Option<Vec<u8>> =
+        (0..text.len()).step_by(2).map(|i| u8::from_str_radix(text.get(i..i + 2)?, 16).ok()).collect();
     let position = serde_json::from_value(extra.get(START_STEPS)?.clone()).ok()?;
     let instructions: Result<Vec<Instruction>, _> =
         daic_protocol::program::decode(&bytes?).map(|(_, instruction)| instruction).collect();
@@ -376,8 +378,11 @@ fn write_optics(
         optics: optics_section::with_calibrated(&experiment.optics, optics),
     };
     let path = directory.join("optics.toml");
-    let text = file.to_toml().map_err(|source| Error::Unwritable { path: path.clone(), reason: source.to_string() })?;
-    std::fs::create_dir_all(directory).map_err(|source| Error::Folder { path: directory.to_owned(), source })?;
+    let text = file
+        .to_toml()
+        .map_err(|source| Error::Unwritable { path: path.clone(), reason: source.to_string() })?;
+    std::fs::create_dir_all(directory)
+        .map_err(|source| Error::Folder { path: directory.to_owned(), source })?;
     Ok(atomic::write_bytes(&path, text.as_bytes())?)
 }
 

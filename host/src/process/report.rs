@@ -7,7 +7,8 @@ use crate::measure::Rectangle;
 use daic_dataset::{Dataset, FloatMap};
 use daic_protocol::channels;
 use daic_report::{
-    AnalogTrace, Cell, DigitalLine, Figure, Report, Section, TableBlock, Timeline, Verdict, plain, with_uncertainty,
+    AnalogTrace, Cell, DigitalLine, Figure, Report, Section, TableBlock, Timeline, Verdict, plain,
+    with_uncertainty,
 };
 use daic_rig::experiment::Experiment;
 
@@ -27,10 +28,18 @@ pub fn report(
     let reference: ReferenceResult = super::read_json(&result).ok_or(Error::NoResult { path: result })?;
     let mut sections = Vec::new();
     if let Some(checks) = checks {
-        sections.push(Section { title: "Checks".to_owned(), tables: vec![check_table(checks)], ..Section::default() });
+        sections.push(Section {
+            title: "Checks".to_owned(),
+            tables: vec![check_table(checks)],
+            ..Section::default()
+        });
     }
     let height = FloatMap::read_tiff(&dataset.frame_results(reference_record.id).join("h_mm.tif"))?;
-    figures::write_surface_svg(&dataset.results().join(super::FIGURES).join("surface.svg"), &height, "Surface")?;
+    figures::write_surface_svg(
+        &dataset.results().join(super::FIGURES).join("surface.svg"),
+        &height,
+        "Surface",
+    )?;
     if let Some(last) = summary.measured.last() {
         let mut figures = Vec::new();
         let directory = dataset.frame_results(last.id);
@@ -62,14 +71,24 @@ pub fn report(
         )],
         tables: Vec::new(),
         figures: vec![
-            figures::map_figure(&height, "Height", "h", Unit::Millimetre, "Height towards the camera over the reference plane.")?,
+            figures::map_figure(
+                &height,
+                "Height",
+                "h",
+                Unit::Millimetre,
+                "Height towards the camera over the reference plane.",
+            )?,
             figures::surface_figure(&height, "Surface", "Drag to turn, scroll to zoom.")?,
         ],
     });
     let frame = dataset.read_frame(reference_record)?;
     let rectangle = |c: [usize; 4]| Rectangle { x: c[0], y: c[1], width: c[2], height: c[3] };
-    let overlay =
-        figures::views_overlay(&frame, rectangle(reference.minus), rectangle(reference.plus), "Reference frame");
+    let overlay = figures::views_overlay(
+        &frame,
+        rectangle(reference.minus),
+        rectangle(reference.plus),
+        "Reference frame",
+    );
     sections.push(Section {
         title: "The two views".to_owned(),
         text: Vec::new(),
@@ -139,11 +158,22 @@ fn check_table(checks: &[Check]) -> TableBlock {
 }
 
 fn move_table(summary: &Summary) -> TableBlock {
-    let head = ["frame", "component", "commanded", "measured (mean)", "difference, RMS", "scatter", "σ of a point", "points"];
+    let head = [
+        "frame",
+        "component",
+        "commanded",
+        "measured (mean)",
+        "difference, RMS",
+        "scatter",
+        "σ of a point",
+        "points",
+    ];
     let mut rows = Vec::new();
     for frame in &summary.measured {
         for (i, axis) in AXES.iter().enumerate() {
-            let number = |value: Option<f64>| Cell::Number(value.map_or_else(|| "—".to_owned(), |v| plain(v, 3, "µm")));
+            let number = |value: Option<f64>| {
+                Cell::Number(value.map_or_else(|| "—".to_owned(), |v| plain(v, 3, "µm")))
+            };
             // the mean of many points is as sure as the calibration and the stage, not as its standard error
             rows.push(vec![
                 Cell::Text(if i == 0 { frame.name.clone() } else { String::new() }),
@@ -153,7 +183,11 @@ fn move_table(summary: &Summary) -> TableBlock {
                 number(frame.rms_um.map(|r| r[i])),
                 number(Some(frame.field.std_um[i])),
                 number(Some(frame.field.sigma_um[i])),
-                Cell::Number(if i == 0 { format!("{} of {}", frame.field.ok, frame.field.points) } else { String::new() }),
+                Cell::Number(if i == 0 {
+                    format!("{} of {}", frame.field.ok, frame.field.points)
+                } else {
+                    String::new()
+                }),
             ]);
         }
     }
@@ -180,7 +214,11 @@ fn calibration_table(summary: &Summary) -> Option<TableBlock> {
     Some(TableBlock {
         caption: format!(
             "{} observations of {} points, {} left out; residual {:.4} px RMS, reduced χ² {:.2}",
-            calibration.observations, calibration.points, calibration.rejected, calibration.rms_px, calibration.chi_square_reduced
+            calibration.observations,
+            calibration.points,
+            calibration.rejected,
+            calibration.rms_px,
+            calibration.chi_square_reduced
         ),
         head: ["parameter", "before", "after"].map(str::to_owned).to_vec(),
         rows,
@@ -274,7 +312,8 @@ fn stage_traces(dataset: &Dataset, experiment: &Experiment, words: &[(u64, u32)]
     let start = stored_program(dataset).map_or([0; 6], |p| p.1);
     let mut traces = Vec::new();
     for (number, (name, axis)) in (0u8..).zip(experiment.rig.axes.named()) {
-        let (Some(axis), Some(step), Some(direction)) = (axis, channels::step(number), channels::direction(number))
+        let (Some(axis), Some(step), Some(direction)) =
+            (axis, channels::step(number), channels::direction(number))
         else {
             continue;
         };
@@ -344,8 +383,12 @@ fn provenance(dataset: &Dataset, experiment: &Experiment, summary: &Summary) -> 
     if let Some(seed) = summary.seed {
         all.push(("seed".to_owned(), seed.to_string()));
     }
-    all.extend(manifest.extra.iter().filter(|(k, _)| *k != super::PROGRAM).map(|(k, v)| {
-        (k.clone(), v.as_str().map_or_else(|| v.to_string(), str::to_owned))
-    }));
+    all.extend(
+        manifest
+            .extra
+            .iter()
+            .filter(|(k, _)| *k != super::PROGRAM)
+            .map(|(k, v)| (k.clone(), v.as_str().map_or_else(|| v.to_string(), str::to_owned))),
+    );
     all
 }
