@@ -17,7 +17,6 @@ use daic_rig::link::{Link, LinkOptions};
 use daic_rig::pairing;
 use serde_json::{Value, json};
 use std::path::Path;
-use std::sync::atomic::AtomicBool;
 
 /// Writes frames and events into a dataset while they arrive.
 struct Writer {
@@ -119,7 +118,7 @@ pub fn record(
         options,
         &mut writer,
         &mut report,
-        &AtomicBool::new(false),
+        progress.stop_requested(),
     )?;
     judge(&mut writer.recording, experiment, &compiled, &run)?;
     let counts = run.pairing.counts;

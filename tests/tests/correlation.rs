@@ -161,11 +161,11 @@ fn challenge_12_plate_with_a_hole() {
     }
 }
 
-/// Nodes of the grid (step 5 from pixel 16) whose 33 × 33 subset lies on the specimen in the first frame.
+/// Nodes of the grid (step 5 from pixel 20) whose 33 × 33 subset lies on the specimen in the first frame.
 fn inside_nodes() -> std::collections::HashSet<(i64, i64)> {
     let mut nodes = std::collections::HashSet::new();
-    for x in (16..384).step_by(5) {
-        for y in (16..1024).step_by(5) {
+    for x in (20..380).step_by(5) {
+        for y in (20..1020).step_by(5) {
             if on_specimen(x, y) {
                 nodes.insert((x, y));
             }

@@ -233,7 +233,8 @@ fn parse_move(text: &str) -> Result<Move, String> {
     // the demo's scene keeps both views on the sensor and the specimen in range within these
     const LIMIT_MM: [f64; 3] = [0.5, 0.5, 2.0];
     for ((value, limit), axis) in values.iter().zip(LIMIT_MM).zip(["X", "Y", "Z"]) {
-        if !(value.abs() <= limit) {
+        // not-a-number is refused too
+        if value.is_nan() || value.abs() > limit {
             return Err(format!("{axis} is {value} mm; allowed are -{limit} to {limit} mm"));
         }
     }

@@ -55,12 +55,14 @@ pub fn simulate(arguments: &SimulateArgs, output: &Output) -> Result<Answer, Err
     if let Some(seed) = arguments.seed {
         experiment.seed = seed;
     }
+    output.stop_rig_on_interrupt();
     let recorded = daic::demo::simulate(&experiment, arguments.scene.as_deref(), &arguments.out, output)?;
     recording_answer(&arguments.out, &recorded)
 }
 
 pub fn run(arguments: &RunArgs, output: &Output) -> Result<Answer, Error> {
     let experiment = Experiment::load(&arguments.experiment)?;
+    output.stop_rig_on_interrupt();
     let port = arguments.port.clone().unwrap_or_else(|| experiment.rig.port.clone());
     let recorded =
         daic::recording::run_at_port(&experiment, &port, &arguments.frames, &arguments.out, output)?;

@@ -3,13 +3,15 @@
 use daic::{Error, Progress};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Value, json};
-use std::sync::Mutex;
+use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Mutex};
 
 /// Where a command reports to.
 pub struct Output {
     json: bool,
     bar: ProgressBar,
     stage: Mutex<String>,
+    stop: Arc<AtomicBool>,
     /// With a terminal the bar shows the stages; without one each gets a line.
     lines: bool,
 }
@@ -47,7 +49,7 @@ impl Output {
         if let Ok(style) = ProgressStyle::with_template("{msg:32} {wide_bar} {pos}/{len} {elapsed}") {
             bar.set_style(style);
         }
-        Self { json, bar, stage: Mutex::default(), lines: !quiet && !terminal }
+        Self { json, bar, stage: Mutex::default(), stop: Arc::default(), lines: !quiet && !terminal }
     }
 
     /// Errors are drawn with the source line underlined, without colour where nobody can see it.
@@ -57,6 +59,17 @@ impl Output {
             Box::new(miette::MietteHandlerOpts::new().width(100).context_lines(1).build())
         }))
         .ok();
+    }
+
+    /// While a rig runs, Ctrl-C stops it in an orderly way; a second one ends the program at once.
+    pub fn stop_rig_on_interrupt(&self) {
+        #[cfg(unix)]
+        for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+            // in this order: the first interrupt finds the flag still down
+            let armed = Arc::clone(&self.stop);
+            signal_hook::flag::register_conditional_shutdown(signal, 130, armed).ok();
+            signal_hook::flag::register(signal, Arc::clone(&self.stop)).ok();
+        }
     }
 
     pub fn answer(&self, answer: &Answer) {
@@ -92,6 +105,10 @@ impl Progress for Output {
 
     fn advance(&self, done: u64) {
         self.bar.set_position(done);
+    }
+
+    fn stop_requested(&self) -> &AtomicBool {
+        &self.stop
     }
 }
 

@@ -160,14 +160,14 @@ impl Reference {
         let rectangle = settings.roi.or_else(|| centres(&found.minus.bounds, settings.dic.radius()));
         let roi = Roi { rectangle, mask: Some(&found.minus.mask) };
         let points = Points::grid(image.width(), image.height(), settings.dic.subset, settings.step, &roi)?;
-        let (u, v) = disparity(model, &found.minus.bounds, settings.height_mm)?;
+        let guess = disparity(model, &found.minus.bounds, settings.height_mm)?;
         let target = Target::new(image.clone(), settings.dic.interpolation);
         let subsets = Subsets::new(image);
         let matched = daic_correlate::correlate(
             &subsets,
             &target,
             &points,
-            &Guess::Search { u, v },
+            &guess,
             &settings.dic,
             &Named("matching the two views", progress),
         )?;
@@ -258,11 +258,7 @@ fn match_of(point: &Point) -> Match {
 }
 
 /// Displacements to be searched from the −1 to the +1 view: what the heights allow over the whole view.
-fn disparity(
-    model: &OpticalModel,
-    view: &Rectangle,
-    height_mm: [f64; 2],
-) -> Result<((f64, f64), (f64, f64)), Error> {
+fn disparity(model: &OpticalModel, view: &Rectangle, height_mm: [f64; 2]) -> Result<Guess<'static>, Error> {
     let (left, top) = (view.x as f64, view.y as f64);
     let (right, bottom) = (left + view.width as f64, top + view.height as f64);
     let (mut u, mut v) = ((f64::INFINITY, f64::NEG_INFINITY), (f64::INFINITY, f64::NEG_INFINITY));
@@ -272,5 +268,5 @@ fn disparity(
         v = (v.0.min(range.v_px[0]), v.1.max(range.v_px[1]));
     }
     let margin = U_MARGIN * u.0.abs().max(u.1.abs());
-    Ok(((u.0 - margin, u.1 + margin), (v.0 - V_MARGIN_PX, v.1 + V_MARGIN_PX)))
+    Ok(Guess::Search { u: (u.0 - margin, u.1 + margin), v: (v.0 - V_MARGIN_PX, v.1 + V_MARGIN_PX) })
 }

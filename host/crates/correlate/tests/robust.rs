@@ -133,15 +133,17 @@ fn unusable_regions_and_points_are_refused() {
 
 #[test]
 fn grid_starts_where_the_first_subset_fits() {
+    // half the subset and the border of 4 px
+    assert_eq!(Points::BORDER, 4);
     let points = Points::grid(N, N, 33, 5, &Roi::default()).unwrap();
-    assert_eq!(points.positions()[0], [16.0, 16.0]);
+    assert_eq!(points.positions()[0], [20.0, 20.0]);
     let last = points.positions().last().unwrap();
-    assert!(last[0] + 16.0 < N as f64 && last[0] + 21.0 >= N as f64);
+    assert!(last[0] + 20.0 < N as f64 && last[0] + 25.0 >= N as f64);
     let rectangle = Some(Rectangle { x: 30, y: 4, width: 20, height: 40 });
     let roi = Roi { rectangle, mask: None };
     let points = Points::grid(N, N, 33, 5, &roi).unwrap();
-    assert_eq!(points.positions()[0], [30.0, 16.0]);
-    assert_eq!(points.positions().last(), Some(&[45.0, 41.0]));
+    assert_eq!(points.positions()[0], [30.0, 20.0]);
+    assert_eq!(points.positions().last(), Some(&[45.0, 40.0]));
 }
 
 #[test]
