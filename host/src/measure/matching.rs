@@ -239,8 +239,12 @@ impl Reference {
     }
 }
 
+/// Edges of a view are found to about this many pixels; subsets stay as far inside.
+const VIEW_EDGE_PX: usize = 8;
+
 /// Where the centres of subsets can lie that are wholly inside `view`; `None` where there is no room.
-fn centres(view: &Rectangle, radius: usize) -> Option<Rectangle> {
+fn centres(view: &Rectangle, subset_radius: usize) -> Option<Rectangle> {
+    let radius = subset_radius + VIEW_EDGE_PX;
     let (width, height) = (view.width.checked_sub(2 * radius)?, view.height.checked_sub(2 * radius)?);
     (width > 0 && height > 0).then_some(Rectangle { x: view.x + radius, y: view.y + radius, width, height })
 }
