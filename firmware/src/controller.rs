@@ -91,6 +91,16 @@ impl Controller {
         self.fault
     }
 
+    /// Sequence number the next event will have.
+    pub fn next_event(&self) -> u32 {
+        self.out.log.next()
+    }
+
+    /// One past the highest sequence number of an event ever put into a reply.
+    pub fn events_read(&self) -> u32 {
+        self.out.log.read_end()
+    }
+
     /// Hash of the committed program.
     pub fn program(&self) -> Option<u32> {
         self.loader.hash()

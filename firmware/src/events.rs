@@ -24,6 +24,11 @@ impl EventLog {
         self.next
     }
 
+    /// One past the highest sequence number ever put into a reply.
+    pub(crate) fn read_end(&self) -> u32 {
+        self.read
+    }
+
     pub(crate) fn push(&mut self, tick: u64, kind: EventKind) {
         if self.ring.is_full()
             && let Some(lost) = self.ring.pop_front()

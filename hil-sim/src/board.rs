@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use daic_firmware::{AxisLimits, Board, Controller, LedLimits, Sink};
 use daic_protocol::channels::{AXES, LEDS, SAFE_WORD};
-use daic_protocol::limits::TICK_HZ;
+use daic_protocol::limits::{EVENT_RING, EVENTS_PER_REPLY, TICK_HZ};
 use daic_protocol::message::Capabilities;
 
 use crate::config::{BoardConfig, ClockMode, FaultsConfig, SimConfig};
@@ -18,6 +18,12 @@ use crate::world::{ExposureRecord, World};
 
 /// In stepped mode a program is played for so many virtual seconds before the link is polled in between.
 pub const STEPPED_PATIENCE_S: f64 = 60.0;
+
+/// Unread events of a run at which stepped time stands still until a host reads: what is left of the
+/// ring takes what one tick brings, and keeps the last replies' events for a host that asks again.
+const UNREAD_MAX: u32 = (EVENT_RING - 4 * EVENTS_PER_REPLY) as u32;
+/// Without a host that reads, stepped time stands still no longer than this (by the wall clock).
+const UNREAD_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Longest sleep of the loop, which bounds the delay of a stop.
 const NAP: Duration = Duration::from_millis(10);
@@ -124,6 +130,37 @@ pub(crate) struct BoardThread {
     boot_tick: u64,
     boots: u32,
     answered: u32,
+    reading: Reading,
+}
+
+/// Whether the host keeps up with reading events.
+#[derive(Debug, Default)]
+struct Reading {
+    /// Sequence number of the run's first event.
+    first: u32,
+    /// Where reading stood when last looked at.
+    read: u32,
+    /// Since when stepped time stands still.
+    held: Option<Instant>,
+    /// Patience has run out, and nothing has been read since.
+    given_up: bool,
+}
+
+impl Reading {
+    /// Whether playing on may overwrite what a host has yet to read.
+    fn behind(&mut self, next: u32, read: u32) -> bool {
+        if read != self.read {
+            *self = Self { first: self.first, read, ..Self::default() };
+        }
+        // Sequence numbers wrap; what came before the run does not count.
+        let unread = next.wrapping_sub(self.first).min(next.wrapping_sub(read));
+        if self.given_up || unread < UNREAD_MAX {
+            self.held = None;
+            return false;
+        }
+        self.given_up = self.held.get_or_insert_with(Instant::now).elapsed() >= UNREAD_PATIENCE;
+        !self.given_up
+    }
 }
 
 impl BoardThread {
@@ -144,6 +181,7 @@ impl BoardThread {
             boot_tick: 0,
             boots: 1,
             answered: 0,
+            reading: Reading::default(),
         }
     }
 
@@ -163,7 +201,7 @@ impl BoardThread {
         let mut buffer = [0; 1024];
         while !self.shared.stopping() {
             self.take_commands();
-            let nap = if self.due().is_some() {
+            let nap = if self.due().is_some() && !self.held() {
                 self.play_on(SLICE, 0);
                 Duration::ZERO
             } else {
@@ -173,17 +211,21 @@ impl BoardThread {
             self.before_bytes();
             for &byte in &buffer[..count] {
                 // Byte by byte, so that nothing depends on how the stream was cut.
-                self.now += byte_ticks;
-                self.play_until(self.now);
+                self.pass(byte_ticks);
                 let idle = self.due().is_none();
                 let answer = self.receive(&[byte]);
-                self.now += byte_ticks * answer.len() as u64;
+                let started = idle && self.due().is_some();
+                if started {
+                    let (first, read) = (self.controller.next_event(), self.controller.events_read());
+                    self.reading = Reading { first, read, ..Reading::default() };
+                }
+                self.pass(byte_ticks * answer.len() as u64);
                 if !answer.is_empty() {
                     // Whoever reads the answer may rely on the state published.
                     self.publish();
                     self.link.write(&answer);
                 }
-                if idle && self.due().is_some() {
+                if started {
                     self.play_on(0, (STEPPED_PATIENCE_S * f64::from(TICK_HZ)) as u64);
                 }
                 if self.shared.stopping() {
@@ -199,7 +241,7 @@ impl BoardThread {
         let end = self.now.saturating_add(ticks);
         let mut played = 0usize;
         while let Some(due) = self.due() {
-            if due > end && played >= outputs {
+            if (due > end && played >= outputs) || self.held() {
                 return;
             }
             self.play_until(due);
@@ -218,6 +260,25 @@ impl BoardThread {
             self.now = self.now.max(free);
             self.world.advance(self.now);
         }
+    }
+
+    /// Lets stepped time pass, which stands still before the next output while the host is behind.
+    fn pass(&mut self, ticks: u64) {
+        let end = self.now.saturating_add(ticks);
+        while let Some(due) = self.due().filter(|&due| due <= end) {
+            if self.held() {
+                self.now = self.now.max(due.saturating_sub(1));
+                return;
+            }
+            self.play_until(due);
+            self.now = self.now.max(due);
+        }
+        self.now = end;
+        self.play_until(end);
+    }
+
+    fn held(&mut self) -> bool {
+        self.reading.behind(self.controller.next_event(), self.controller.events_read())
     }
 
     fn run_wall(&mut self, rate: f64) {
@@ -312,6 +373,7 @@ impl BoardThread {
         self.boots += 1;
         self.boot_tick = self.now;
         self.controller = boot(&self.config, self.boots);
+        self.reading = Reading::default();
         self.world.word(self.now, SAFE_WORD);
         for led in 0..LEDS {
             self.world.level(self.now, led, 0);

@@ -59,6 +59,8 @@ enum Failure {
     Config(#[from] ConfigError),
     #[error(transparent)]
     Rig(#[from] SimError),
+    #[error("--frames {}: the directory cannot be made: {cause}", path.display())]
+    FramesDirectory { path: PathBuf, cause: std::io::Error },
     #[error("signals cannot be waited for: {0}")]
     Signals(nix::errno::Errno),
     #[error("{} cannot be written: {cause}", path.display())]
@@ -74,7 +76,8 @@ impl Failure {
             Self::SceneUnreadable { .. }
             | Self::SceneRefused { .. }
             | Self::Config(_)
-            | Self::Rig(SimError::Config(_)) => 2,
+            | Self::FramesDirectory { .. }
+            | Self::Rig(SimError::Config(_) | SimError::Tcp { .. } | SimError::PtyLink { .. }) => 2,
             _ => 3,
         }
     }
@@ -165,7 +168,8 @@ fn run(arguments: &Arguments) -> Result<(), Failure> {
 }
 
 fn open_frames(directory: &std::path::Path) -> Result<FrameWriter, Failure> {
-    FrameWriter::open(directory).map_err(|cause| Failure::Unwritable { path: directory.to_owned(), cause })
+    FrameWriter::open(directory)
+        .map_err(|cause| Failure::FramesDirectory { path: directory.to_owned(), cause })
 }
 
 fn wait_in_background(until_eof: bool, signals: SigSet, end: Sender<End>) {

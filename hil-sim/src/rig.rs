@@ -80,7 +80,7 @@ impl SimRig {
         Ok(())
     }
 
-    /// Where the box is: a device path, an address, or "in-process".
+    /// Where the box is: a device path, `tcp://host:port`, or "in-process".
     pub fn port(&self) -> &str {
         &self.port
     }

@@ -155,7 +155,8 @@ fn pty_end_to_end_with_two_hosts_after_each_other() {
 fn tcp_with_two_hosts_after_each_other() {
     let rig = SimRig::start(small(), Transport::Tcp { address: "127.0.0.1:0".into() }).expect("starts");
     let connect = || {
-        let stream = std::net::TcpStream::connect(rig.port()).expect("connects");
+        let stream = std::net::TcpStream::connect(rig.port().strip_prefix("tcp://").expect("prefix"))
+            .expect("connects");
         stream.set_read_timeout(Some(Duration::from_millis(100))).expect("set");
         stream
     };
@@ -206,6 +207,47 @@ fn wall_clock_mode_takes_real_time() {
     host.run(&[Instruction::Delay { ticks: 300_000 * US }]);
     assert!(start.elapsed() >= Duration::from_millis(300), "{:?}", start.elapsed());
     exercise(&rig, &mut host);
+}
+
+/// More events than the box keeps: stepped time waits for the host, and none is lost.
+#[test]
+fn no_event_is_lost_however_long_the_program() {
+    let pulses = 200;
+    let mut program = Vec::new();
+    for id in 0..pulses {
+        program.push(Instruction::Mark { id });
+        program.extend([
+            set(led(), 100 * US),
+            clear(led(), 100 * US),
+            Instruction::Delay { ticks: 1000 * US },
+        ]);
+    }
+    let run = |polls: u32| {
+        let rig = SimRig::start(small(), Transport::InProcess).expect("starts");
+        let mut host = Host::new(rig.connect().expect("in-process"));
+        // Events left over by a host that never read must not disturb the next one.
+        host.run(&program[..4]);
+        let first = host.status().next_event;
+        host.start(&program);
+        for _ in 0..polls {
+            host.status();
+        }
+        let mut events: Vec<daic_protocol::message::Event> = Vec::new();
+        while !events.last().is_some_and(|e| matches!(e.kind, EventKind::RunDone { .. })) {
+            let from = events.last().map_or(first, |e| e.seq + 1);
+            let reply = host.request(&daic_protocol::message::Request::ReadEvents { from });
+            let daic_protocol::message::Reply::Events(reply) = reply else { panic!("{reply:?}") };
+            assert_eq!(reply.dropped, 0);
+            events.extend(reply.events);
+        }
+        (first, events, rig.played())
+    };
+    let (first, events, played) = run(0);
+    assert!(events.len() > 600, "{}", events.len());
+    assert!(events.iter().zip(first..).all(|(e, seq)| e.seq == seq), "none is missing");
+    let Some(EventKind::RunDone { events: announced, .. }) = events.last().map(|e| e.kind) else { panic!() };
+    assert_eq!(announced as usize, events.len());
+    assert!(run(50) == (first, events, played), "what is played does not depend on when the host reads");
 }
 
 /// An endless program can be aborted in stepped mode too, where it is played faster than time.
@@ -283,7 +325,7 @@ fn program_ends_on_a_signal_and_refuses_bad_scenes() {
     let mut running = running;
     let mut line = String::new();
     BufReader::new(running.0.stdout.take().expect("piped")).read_line(&mut line).expect("a line");
-    assert!(line.starts_with("port: 127.0.0.1:"), "{line}");
+    assert!(line.starts_with("port: tcp://127.0.0.1:"), "{line}");
     let id = nix::unistd::Pid::from_raw(running.0.id() as i32);
     nix::sys::signal::kill(id, nix::sys::signal::Signal::SIGTERM).expect("sent");
     assert!(running.0.wait().expect("ends").success());
@@ -297,8 +339,16 @@ fn program_ends_on_a_signal_and_refuses_bad_scenes() {
     assert!(message.contains("exposure") && message.contains("line 2"), "{message}");
     let absent = program(&["--scene", "absent.toml"]).output().expect("runs");
     assert_eq!(absent.status.code(), Some(2));
-    let busy = program(&["--tcp", "256.0.0.1:1"]).output().expect("runs");
-    assert_eq!(busy.status.code(), Some(3));
+    let address = program(&["--tcp", "256.0.0.1:1"]).output().expect("runs");
+    assert_eq!(address.status.code(), Some(2));
+    // A file stands where the directory should be.
+    let frames = program(&["--frames", scene.to_str().expect("utf-8")]).output().expect("runs");
+    assert_eq!(frames.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&frames.stderr).contains("--frames"));
+    std::fs::write(&scene, "[light]\nled_electrons_per_s = [inf, 0, 0, 0, 0, 0, 0, 0]\n").expect("written");
+    let light = program(&["--scene", scene.to_str().expect("utf-8")]).output().expect("runs");
+    let message = String::from_utf8_lossy(&light.stderr);
+    assert!(message.contains("light.led_electrons_per_s = inf"), "{message}");
 
     let printed = program(&["--print-scene", "--seed", "9"]).output().expect("runs");
     let config = daic_hil_sim::SimConfig::from_toml(&String::from_utf8(printed.stdout).expect("utf-8"))

@@ -7,7 +7,7 @@ use crate::progress::Progress;
 use crate::recording::{self, Destination};
 use crate::simulated::{self, SimCamera};
 use daic_dataset::{Dataset, Existing, Table};
-use daic_hil_sim::config::{ClockMode, SimConfig};
+use daic_hil_sim::config::SimConfig;
 use daic_hil_sim::rig::SimRig;
 use daic_hil_sim::transport::Transport;
 use daic_optics::Optics;
@@ -54,8 +54,8 @@ pub struct DemoSummary {
     pub checks: Vec<Check>,
     /// Whether every check held.
     pub passed: bool,
-    /// Wall time from the start of the rig to the report.
-    pub wall_s: f64,
+    /// Wall time from the start of the rig to the end of the measurement.
+    pub wall_s: Option<f64>,
 }
 
 /// The demo's experiment: the template with this seed and move, and optics that are wrong on purpose.
@@ -100,20 +100,40 @@ pub fn run(options: &Options, progress: &dyn Progress) -> Result<DemoSummary, Er
     let begin = Instant::now();
     let (experiment, truth) = experiment(options)?;
     let config = simulated::configuration(&experiment, &truth, simulated::demo_specimen());
-    let (dataset, _) = record(&experiment, config, &options.out, Existing::Replace, progress)?;
-    let processed = process::process(&options.out, false, progress)?;
+    record(&experiment, config, &options.out, Existing::ReplaceKind(DEMO), progress)?;
+    let mut processed = process::process(&options.out, false, progress)?;
+    processed.wall_s = Some(begin.elapsed().as_secs_f64());
+    complete(&options.out, &processed)?.ok_or(Error::NoResult { path: options.out.join("dataset.json") })
+}
+
+/// Kind of the demo's datasets: one demo may replace another, never a measurement.
+const DEMO: &str = "demo";
+
+fn is_demo(dataset: &Dataset) -> bool {
+    dataset.manifest().kind.as_deref() == Some(DEMO)
+}
+
+/// Adds to the summary and report of a processed demo what only a demo knows; `None` for other datasets.
+///
+/// # Errors
+/// If results cannot be read or summary and report cannot be written.
+pub fn complete(root: &Path, processed: &process::Processed) -> Result<Option<DemoSummary>, Error> {
+    let dataset = Dataset::open(root)?;
+    if !is_demo(&dataset) {
+        return Ok(None);
+    }
     let profile_rms_um = profile_error_um(&dataset)?;
     let checks = checks(&processed.summary, profile_rms_um);
     let summary = DemoSummary {
         passed: checks.iter().all(|c| c.passed),
-        measurement: processed.summary,
+        measurement: processed.summary.clone(),
         profile_rms_um,
         checks,
-        wall_s: begin.elapsed().as_secs_f64(),
+        wall_s: processed.wall_s,
     };
     dataset.write_summary(&summary)?;
     process::write_report(&dataset, &summary.measurement, Some(&summary.checks))?;
-    Ok(summary)
+    Ok(Some(summary))
 }
 
 /// Runs an experiment on the simulated rig. `scene` replaces the rig that the experiment describes.
@@ -124,6 +144,7 @@ pub fn simulate(
     experiment: &Experiment,
     scene: Option<&Path>,
     out: &Path,
+    existing: Existing,
     progress: &dyn Progress,
 ) -> Result<FrameCounts, Error> {
     let truth = optics_section::from_section(&experiment.optics)?;
@@ -131,36 +152,18 @@ pub fn simulate(
     if let Some(path) = scene {
         config = SimConfig { seed: experiment.seed, ..simulated::load_scene(path)? };
     }
-    Ok(record(experiment, config, out, Existing::Refuse, progress)?.1)
-}
-
-/// More frames than this give more events than the box keeps; then its clock must run slowly enough for the
-/// host to fetch them.
-const FRAMES_AT_ONCE: u64 = 30;
-
-fn frames_of(steps: &[Step]) -> u64 {
-    steps
-        .iter()
-        .map(|step| match step {
-            Step::Frame(_) => 1,
-            Step::Repeat(repeat) => u64::from(repeat.times).saturating_mul(frames_of(&repeat.steps)),
-            Step::Move(_) | Step::Settle(_) | Step::Level(_) => 0,
-        })
-        .fold(0, u64::saturating_add)
+    Ok(record(experiment, config, out, existing, progress)?.1)
 }
 
 /// Starts a rig on a PTY, records, and notes the edges that were really played.
 fn record(
     experiment: &Experiment,
-    mut config: SimConfig,
+    config: SimConfig,
     out: &Path,
     existing: Existing,
     progress: &dyn Progress,
 ) -> Result<(Dataset, FrameCounts), Error> {
     progress.stage("starting the simulated rig", 0);
-    if frames_of(&experiment.sequence) > FRAMES_AT_ONCE {
-        config.clock = ClockMode::Wall { rate: 1.0 };
-    }
     let mut rig = SimRig::start(config.clone(), transport())?;
     let frames = rig.take_frames().ok_or(Error::FramesTaken)?;
     let mut camera = SimCamera::new(&config, frames);
@@ -169,6 +172,7 @@ fn record(
     let options = AcquireOptions {
         // rendering a frame takes its time on a small machine
         frame_timeout: std::time::Duration::from_secs(60),
+        size_px: Some(recording::size_px(experiment)),
         ..AcquireOptions::new(tick_hz)
     };
     let destination = Destination { out, existing, seed: Some(experiment.seed) };

@@ -137,6 +137,27 @@ pub enum Error {
         /// Frames in it.
         frames: usize,
     },
+    /// The plan in a manifest.
+    #[error(
+        "the plan in dataset.json cannot be read ({reason}); frames of an interrupted recording cannot be told apart without it"
+    )]
+    Plan {
+        /// What is wrong.
+        reason: String,
+    },
+    /// No point came out.
+    #[error(
+        "no point could be measured ({reasons}): do the optics fit this frame, and do both frames show the same specimen?"
+    )]
+    NothingMeasured {
+        /// How many points failed for which reason.
+        reasons: String,
+    },
+    /// No folder of frames.
+    #[error(
+        "where do frames come from? Give --frames FOLDER, or `source = {{ folder = \"…\" }}` in [rig.camera]; `daic simulate` is for the simulated rig"
+    )]
+    NoFrames,
     /// A result that should be there is not.
     #[error("{} is missing or damaged; run `daic process --fresh` on the dataset", path.display())]
     NoResult {

@@ -29,6 +29,7 @@ pub mod settings;
 #[cfg(feature = "sim")]
 pub mod simulated;
 pub mod usage;
+mod verdicts;
 
 pub use error::Error;
 pub use progress::{Progress, Silent};

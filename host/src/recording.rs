@@ -4,17 +4,14 @@ use crate::error::Error;
 use crate::folder_camera::FolderCamera;
 use crate::process::{FrameCounts, PROGRAM, START_STEPS};
 use crate::progress::Progress;
-use daic_dataset::{
-    Dataset, EventRecord, Existing, FrameRecord, FrameRole, GreyImage, Manifest, Recording, StrobeRecord,
-    Verdict,
-};
+use crate::verdicts;
+use daic_dataset::{Dataset, EventRecord, Existing, FrameRecord, FrameRole, GreyImage, Manifest, Recording};
 use daic_protocol::message::{Event, EventKind};
 use daic_rig::acquire::{self, AcquireOptions, FrameSink, Run, SinkError};
 use daic_rig::camera::{Camera, CameraSettings, Frame};
-use daic_rig::compile::{Compiled, PlannedFrame, compile};
-use daic_rig::experiment::{Experiment, Role};
+use daic_rig::compile::{Compiled, compile};
+use daic_rig::experiment::Experiment;
 use daic_rig::link::{Link, LinkOptions};
-use daic_rig::pairing;
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -95,13 +92,15 @@ pub fn record(
         reason: source.to_string(),
     })?;
     let manifest = manifest(&compiled, link, camera, start, destination.seed);
-    let recording = Dataset::create(destination.out, manifest, &text, destination.existing)?;
-    let mut writer = Writer { recording, next: 0 };
     let settings = CameraSettings {
         exposure: experiment.rig.camera.exposure,
         bits: experiment.rig.camera.bits,
         hardware_trigger: true,
     };
+    // a camera that refuses does so before anything is written
+    camera.configure(&settings).map_err(daic_rig::RigError::from)?;
+    let recording = Dataset::create(destination.out, manifest, &text, destination.existing)?;
+    let mut writer = Writer { recording, next: 0 };
     let planned = compiled.plan.frames.len() as u64;
     progress.stage("recording", planned);
     let mut report = |state| match state {
@@ -143,21 +142,7 @@ fn manifest(
     let hello = link.hello();
     manifest.seed = seed;
     manifest.tick_hz = Some(f64::from(hello.tick_hz));
-    manifest.plan = compiled
-        .plan
-        .frames
-        .iter()
-        .map(|f| {
-            json!({
-                "index": f.index,
-                "name": f.name,
-                "role": format!("{:?}", f.role).to_lowercase(),
-                "asked_mm": f.asked_mm,
-                "position_mm": f.position_mm,
-                "position_steps": f.position_steps,
-            })
-        })
-        .collect();
+    manifest.plan = json!(verdicts::planned(&compiled.plan));
     let program: String = compiled.program.iter().map(|byte| format!("{byte:02x}")).collect();
     let info = camera.info();
     manifest.extra.insert(PROGRAM.to_owned(), program.into());
@@ -178,54 +163,28 @@ fn judge(
     run: &Run,
 ) -> Result<(), Error> {
     let mut records = recording.dataset().frames()?.records;
-    let exposure_ns = experiment.rig.camera.exposure.ns().round() as u64;
-    for (record, frame) in records.iter_mut().zip(&run.frames) {
-        match frame.verdict {
-            pairing::Verdict::Paired { trigger, .. } => {
-                record.verdict = Verdict::Paired;
-                planned(record, compiled.plan.frames.get(trigger), run, trigger);
-                record.exposure_ns = Some(exposure_ns);
-            }
-            pairing::Verdict::Extra => record.verdict = Verdict::Extra,
-            pairing::Verdict::Ambiguous => record.verdict = Verdict::Ambiguous,
+    let arrived = records.len();
+    let triggers: Vec<_> = run.triggers.iter().map(|t| t.trigger).collect();
+    let plan = verdicts::planned(&compiled.plan);
+    verdicts::apply(&mut records, &run.pairing, &triggers, &plan, exposure_ns(experiment));
+    for (k, record) in records.into_iter().enumerate() {
+        if k < arrived {
+            recording.revise_frame(&record)?;
+        } else {
+            recording.append_frame(record, None)?;
         }
-        recording.revise_frame(record)?;
-    }
-    let next = records.len() as u64;
-    let missing = run.pairing.triggers.iter().enumerate().filter(|(_, frame)| frame.is_none());
-    for (id, (trigger, _)) in (next..).zip(missing) {
-        let mut record = FrameRecord::new(id, "missing", FrameRole::Unplanned);
-        record.verdict = Verdict::Missing;
-        planned(&mut record, compiled.plan.frames.get(trigger), run, trigger);
-        recording.append_frame(record, None)?;
     }
     Ok(())
 }
 
-fn planned(record: &mut FrameRecord, plan: Option<&PlannedFrame>, run: &Run, trigger: usize) {
-    let Some(plan) = plan else { return };
-    plan.name.clone_into(&mut record.name);
-    record.role = match plan.role {
-        Role::Calibration => FrameRole::Calibration,
-        Role::Reference => FrameRole::Reference,
-        Role::Deformed | Role::Series => FrameRole::Measurement,
-    };
-    // a stage can only stand on whole steps: that is what was really commanded
-    record.commanded_um = Some(plan.position_mm.map(|mm| mm * 1e3));
-    if let Some(played) = run.triggers.get(trigger) {
-        record.trigger_tick = Some(played.trigger.tick);
-        record.strobes = played
-            .trigger
-            .strobe
-            .iter()
-            .map(|pulse| StrobeRecord {
-                led: pulse.led,
-                on_tick: pulse.on,
-                off_tick: pulse.off,
-                level: f64::from(plan.strobe.level) / f64::from(u16::MAX),
-            })
-            .collect();
-    }
+/// Exposure of every frame.
+pub fn exposure_ns(experiment: &Experiment) -> u64 {
+    experiment.rig.camera.exposure.ns().round() as u64
+}
+
+/// Columns and rows of every frame.
+pub fn size_px(experiment: &Experiment) -> [u32; 2] {
+    [experiment.rig.camera.width, experiment.rig.camera.height]
 }
 
 /// Link settings of an experiment.
@@ -246,16 +205,17 @@ pub fn run_at_port(
     port: &str,
     frames: &Path,
     out: &Path,
+    existing: Existing,
     progress: &dyn Progress,
 ) -> Result<FrameCounts, Error> {
-    let sensor = [experiment.rig.camera.width, experiment.rig.camera.height];
-    let mut camera = FolderCamera::new(frames, sensor);
+    let mut camera = FolderCamera::new(frames, size_px(experiment));
     progress.stage("asking the box who it is", 0);
     let mut link = Link::open(port, link_options(experiment)).map_err(daic_rig::RigError::from)?;
     let options = AcquireOptions {
         frame_timeout: experiment.rig.frame_timeout.duration(),
+        size_px: Some(size_px(experiment)),
         ..AcquireOptions::new(link.hello().tick_hz)
     };
-    let destination = Destination { out, existing: Existing::Refuse, seed: None };
+    let destination = Destination { out, existing, seed: None };
     Ok(record(experiment, &mut link, &mut camera, &options, &destination, progress)?.1)
 }

@@ -61,6 +61,10 @@ pub fn profile_page(
                 "points with a result",
                 Cell::Number(format!("{} of {}", heights.count, profile.points.len())),
             ),
+            row(
+                "points by status",
+                Cell::Text(measure::status_counts(profile.points.iter().map(|p| p.status))),
+            ),
             row("mean height", number(heights.mean, "mm")),
             row("σ of a single height, RMS", number(sigmas.rms, "µm")),
             row("gap of the two rays, mean", number(gaps.mean, "µm")),
@@ -69,8 +73,9 @@ pub fn profile_page(
     let difference = linear_minus(profile, linear);
     let offset = spread(difference.iter().map(|d| d[2]));
     let mut text = vec![format!(
-        "The same matches decoded by the linearised virtual-object model (decoder `linear`) lie {} higher in the mean",
-        plain(offset.mean, 1, "µm")
+        "The same matches decoded by the linearised virtual-object model (decoder `linear`) lie {} {} in the mean",
+        plain(offset.mean.abs(), 1, "µm"),
+        if offset.mean < 0.0 { "lower" } else { "higher" }
     )];
     if let Some(plane) = plane_of(&difference) {
         let rest = spread(
@@ -166,7 +171,7 @@ pub fn displacement_page(
         })
         .collect();
     let table = TableBlock {
-        caption: format!("{} of {} points", ok().count(), field.points.len()),
+        caption: format!("Points: {}", measure::status_counts(field.points.iter().map(|p| p.status))),
         head: ["component", "mean", "scatter", "σ of a point, RMS"].map(str::to_owned).to_vec(),
         rows,
     };

@@ -166,6 +166,56 @@ fn datasets() {
     place.refused(&["process", "other"], &["99", "newer"]);
 }
 
+/// A recorded dataset of somebody's is not overwritten by the demo, nor a folder that only looks like one.
+#[test]
+fn the_demo_replaces_demos_only() {
+    let place = Place::new();
+    for manifest in [
+        "{\"format\":\"daic-dataset\",\"format_version\":1,\"program\":\"daic\",\"program_version\":\"0\"}",
+        "{broken",
+    ] {
+        std::fs::create_dir_all(place.path("mine/results")).expect("made");
+        std::fs::write(place.path("mine/dataset.json"), manifest).expect("written");
+        std::fs::write(place.path("mine/results/thesis.txt"), b"precious").expect("written");
+        place.refused(&["demo", "--out", "mine"], &["mine"]);
+        assert_eq!(std::fs::read(place.path("mine/results/thesis.txt")).expect("kept"), b"precious");
+    }
+}
+
+#[test]
+fn usage_errors_are_one_json_object_too() {
+    let place = Place::new();
+    for arguments in [
+        &["correlate", "--json"][..],
+        &["demo", "--json", "--move", "1,2"],
+        &["doctor", "--json", "--threads", "100000"],
+    ] {
+        let run = daic(place.0.path(), arguments).expect_code(2);
+        assert_eq!(run.json()["exit_code"], 2, "{arguments:?}");
+    }
+}
+
+/// Frames that show nothing in common: no files, and the reasons counted.
+#[test]
+fn frames_without_a_match() {
+    let test = "frames_without_a_match";
+    let Some(flat) = daic_tests::shared::shared(test, "golden/daic/flat.png") else { return };
+    let place = Place::new();
+    let frame = image::open(&flat).expect("an image").to_luma8();
+    let (width, height) = frame.dimensions();
+    let mut exchanged = frame.clone();
+    for (x, y, pixel) in exchanged.enumerate_pixels_mut() {
+        *pixel = *frame.get_pixel((x + width / 2) % width, y.min(height - 1));
+    }
+    exchanged.save(place.path("exchanged.png")).expect("written");
+    let optics = root().join("examples/golden-macro.toml").display().to_string();
+    let flat = flat.display().to_string();
+    place.refused(
+        &["displacement", "--optics", &optics, &flat, "exchanged.png", "--out", "out"],
+        &["no point", "gap"],
+    );
+}
+
 #[test]
 fn existing_files_are_kept() {
     let place = Place::new();

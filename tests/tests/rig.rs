@@ -168,3 +168,41 @@ fn a_box_that_resets_or_falls_silent_in_the_middle() {
         }
     }
 }
+
+/// More frames than the box keeps events for: none may be lost, whoever runs the clock.
+#[test]
+fn a_long_series_loses_no_event() {
+    let folder = TempDir::new().expect("folder");
+    experiment(folder.path());
+    let text = std::fs::read_to_string(folder.path().join("experiment.toml")).expect("written");
+    let sequence = text.find("[[sequence]]").expect("a sequence");
+    let series = "[[sequence]]\nrepeat = { times = 90, steps = [{ settle = \"1 ms\" }, { frame = { name = \"run\", role = \"series\" } }] }\n";
+    let small =
+        text[..sequence].replace("width = 2592", "width = 324").replace("height = 1944", "height = 243");
+    std::fs::write(folder.path().join("experiment.toml"), small + series).expect("written");
+    let arguments = ["simulate", "experiment.toml", "--quiet", "--json", "--out", "data"];
+    let answer = daic(folder.path(), arguments).expect_code(0).json();
+    assert_eq!(answer["frames"]["paired"], 90, "{answer}");
+}
+
+/// A recording that never came to its verdicts is judged when it is processed.
+#[test]
+fn an_interrupted_recording_can_be_measured() {
+    let folder = TempDir::new().expect("folder");
+    experiment(folder.path());
+    let arguments = ["simulate", "experiment.toml", "--quiet", "--json", "--out", "data"];
+    daic(folder.path(), arguments).expect_code(0);
+    let whole = daic(folder.path(), ["process", "data", "--quiet", "--json"]).expect_code(0).json();
+    // the journal as it was before the run ended: the first line of every frame, and the last one torn
+    let path = folder.path().join("data/frames.jsonl");
+    let text = std::fs::read_to_string(&path).expect("a journal");
+    let pending: Vec<&str> = text.lines().filter(|line| line.contains("\"pending\"")).collect();
+    assert_eq!(pending.len(), 7, "{text}");
+    std::fs::write(&path, pending.join("\n") + "\n{\"id\":7,\"na").expect("written");
+    let summary =
+        daic(folder.path(), ["process", "data", "--quiet", "--json", "--fresh"]).expect_code(0).json();
+    for key in ["frames", "commanded_um", "measured_um", "rms_um", "calibration"] {
+        assert_eq!(summary[key], whole[key], "{key}");
+    }
+    assert_eq!(summary["damage"].as_array().expect("a list").len(), 1, "the torn line is told");
+}

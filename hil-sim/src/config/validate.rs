@@ -79,9 +79,10 @@ impl SimConfig {
         within("camera.offset_dn", camera.offset_dn, 0.0, f64::from((1u32 << camera.bits) - 1))?;
         within("camera.read_noise_electrons", camera.read_noise_electrons, 0.0, 1e6)?;
         within("camera.clock_drift_ppm", camera.clock_drift_ppm, -10_000.0, 10_000.0)?;
-        for &rate in self.light.led_electrons_per_s.iter().chain([&self.light.ambient_electrons_per_s]) {
-            within("light", rate, 0.0, 1e15)?;
+        for &rate in &self.light.led_electrons_per_s {
+            within("light.led_electrons_per_s", rate, 0.0, 1e15)?;
         }
+        within("light.ambient_electrons_per_s", self.light.ambient_electrons_per_s, 0.0, 1e15)?;
         for &steps in &self.stage.steps_per_mm {
             positive("stage.steps_per_mm", steps)?;
         }

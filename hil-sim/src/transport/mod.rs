@@ -27,7 +27,7 @@ pub enum Transport {
     },
     /// A TCP port; one host at a time, the next one waits.
     Tcp {
-        /// Address and port to listen on; port 0 takes a free one.
+        /// Address and port to listen on, with or without `tcp://`; port 0 takes a free one.
         address: String,
     },
 }

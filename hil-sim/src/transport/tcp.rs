@@ -11,6 +11,7 @@ use crate::transport::{Link, ready};
 
 pub(crate) struct Tcp {
     listener: TcpListener,
+    /// As a host names it, `tcp://host:port`.
     address: String,
     client: Option<TcpStream>,
     restarted: bool,
@@ -19,9 +20,10 @@ pub(crate) struct Tcp {
 impl Tcp {
     pub(crate) fn listen(address: &str) -> Result<Self, SimError> {
         let failed = |cause| SimError::Tcp { address: address.to_owned(), cause };
-        let listener = TcpListener::bind(address).map_err(failed)?;
+        let plain = address.strip_prefix("tcp://").unwrap_or(address);
+        let listener = TcpListener::bind(plain).map_err(failed)?;
         listener.set_nonblocking(true).map_err(failed)?;
-        let address = listener.local_addr().map_err(failed)?.to_string();
+        let address = format!("tcp://{}", listener.local_addr().map_err(failed)?);
         Ok(Self { listener, address, client: None, restarted: false })
     }
 

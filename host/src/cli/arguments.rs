@@ -1,7 +1,6 @@
 //! Commands and their flags.
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 /// Measures 3D shape and displacement with one camera behind a transmission grating.
@@ -17,8 +16,8 @@ pub struct Cli {
     #[arg(long, short, global = true)]
     pub quiet: bool,
     /// Threads to compute with (default: all cores); results do not depend on it
-    #[arg(long, global = true, value_name = "N")]
-    pub threads: Option<NonZeroUsize>,
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=4096))]
+    pub threads: Option<u16>,
 }
 
 #[derive(Debug, Subcommand)]
@@ -79,6 +78,9 @@ pub struct SimulateArgs {
     /// Seed of speckle and noise (default: the experiment's)
     #[arg(long)]
     pub seed: Option<u64>,
+    /// Replace a dataset that is in the folder already
+    #[arg(long)]
+    pub replace: bool,
 }
 
 #[derive(Debug, Args)]
@@ -91,9 +93,13 @@ pub struct RunArgs {
     /// Serial port or tcp://HOST:PORT of the trigger box (default: the experiment's)
     #[arg(long)]
     pub port: Option<String>,
-    /// Folder into which the camera's program (or `hil-sim --frames`) writes its frames
+    /// Folder into which the camera's program (or `hil-sim --frames`) writes its frames (default: the
+    /// experiment's `rig.camera.source`)
     #[arg(long, value_name = "DIR")]
-    pub frames: PathBuf,
+    pub frames: Option<PathBuf>,
+    /// Replace a dataset that is in the folder already
+    #[arg(long)]
+    pub replace: bool,
 }
 
 #[derive(Debug, Args)]

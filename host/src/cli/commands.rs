@@ -9,7 +9,7 @@ use super::arguments::{DemoArgs, SimulateArgs};
 use super::output::{Answer, Output};
 use daic::measure::{self, Rectangle, Reference};
 use daic::{Error, doctor as checks, images, optics_section, pair, process as processing, reports};
-use daic_dataset::{GreyImage, atomic};
+use daic_dataset::{Existing, GreyImage, atomic};
 use daic_optics::{Decoder, OpticalModel};
 use daic_rig::experiment::{self, Experiment, OpticsFile};
 use serde_json::json;
@@ -56,7 +56,9 @@ pub fn simulate(arguments: &SimulateArgs, output: &Output) -> Result<Answer, Err
         experiment.seed = seed;
     }
     output.stop_rig_on_interrupt();
-    let recorded = daic::demo::simulate(&experiment, arguments.scene.as_deref(), &arguments.out, output)?;
+    let existing = if arguments.replace { Existing::Replace } else { Existing::Refuse };
+    let recorded =
+        daic::demo::simulate(&experiment, arguments.scene.as_deref(), &arguments.out, existing, output)?;
     recording_answer(&arguments.out, &recorded)
 }
 
@@ -64,8 +66,13 @@ pub fn run(arguments: &RunArgs, output: &Output) -> Result<Answer, Error> {
     let experiment = Experiment::load(&arguments.experiment)?;
     output.stop_rig_on_interrupt();
     let port = arguments.port.clone().unwrap_or_else(|| experiment.rig.port.clone());
+    let frames = match (&arguments.frames, &experiment.rig.camera.source) {
+        (Some(folder), _) | (None, experiment::CameraSource::Folder(folder)) => folder.clone(),
+        (None, experiment::CameraSource::Sim) => return Err(Error::NoFrames),
+    };
+    let existing = if arguments.replace { Existing::Replace } else { Existing::Refuse };
     let recorded =
-        daic::recording::run_at_port(&experiment, &port, &arguments.frames, &arguments.out, output)?;
+        daic::recording::run_at_port(&experiment, &port, &frames, &arguments.out, existing, output)?;
     recording_answer(&arguments.out, &recorded)
 }
 
@@ -86,8 +93,8 @@ fn recording_answer(out: &Path, recorded: &processing::FrameCounts) -> Result<An
 pub fn process(arguments: &ProcessArgs, output: &Output) -> Result<Answer, Error> {
     let processed = processing::process(&arguments.dataset, arguments.fresh, output)?;
     let mut text = String::new();
-    for damage in &processed.damage {
-        eprintln!("note: {damage}");
+    for note in processed.summary.damage.iter().chain(processed.summary.failed.iter().map(|f| &f.reason)) {
+        writeln!(text, "note: {note}").ok();
     }
     for frame in &processed.summary.measured {
         let [u, v, w] = frame.field.measured_um;
@@ -96,6 +103,10 @@ pub fn process(arguments: &ProcessArgs, output: &Output) -> Result<Answer, Error
     }
     let report = arguments.dataset.join("report.html");
     writeln!(text, "{} results were there already; report: {}", processed.resumed, report.display()).ok();
+    #[cfg(feature = "sim")]
+    if let Some(summary) = daic::demo::complete(&arguments.dataset, &processed)? {
+        return Ok(Answer::new(as_json(&summary)?, text));
+    }
     Ok(Answer::new(as_json(&processed.summary)?, text))
 }
 
@@ -209,11 +220,12 @@ pub fn profile(arguments: &ProfileArgs, output: &Output) -> Result<Answer, Error
     let settings = measure_settings(&arguments.dic);
     let reference = Reference::new(&frame, &model, &settings, output)?;
     let decoder = decoder(arguments.decoder);
-    let profile = measure::profile(&reference.grid, &reference.matches, &model, decoder);
+    let profile = measure::profile(&reference.grid, &reference.matches, &model, decoder).with_points()?;
+    let linear = measure::profile(&reference.grid, &reference.matches, &model, Decoder::Linear);
+    // whatever can fail does so before the first file
+    let page = reports::profile_page(&frame, &reference, &profile, &linear, decoder, &settings)?;
     make_folder(&arguments.out)?;
     measure::write_profile(&arguments.out, &profile)?;
-    let linear = measure::profile(&reference.grid, &reference.matches, &model, Decoder::Linear);
-    let page = reports::profile_page(&frame, &reference, &profile, &linear, decoder, &settings)?;
     atomic::write_bytes(&arguments.out.join("report.html"), page.as_bytes())?;
     let summary = processing::profile_summary(&profile);
     let text = format!(
@@ -235,10 +247,18 @@ pub fn displacement(arguments: &DisplacementArgs, output: &Output) -> Result<Ans
     let reference = Reference::new(&frame, &model, &settings, output)?;
     let tracks = reference.track(&deformed, output)?;
     let decoder = decoder(arguments.decoder);
-    let field = measure::displacement(&reference.grid, &reference.matches, &tracks, &model, decoder);
+    let field = measure::displacement(
+        &reference.grid,
+        &reference.matches,
+        &tracks,
+        &model,
+        decoder,
+        settings.height_mm,
+    )
+    .with_points()?;
+    let page = reports::displacement_page(&frame, &reference, &field, decoder, &settings)?;
     make_folder(&arguments.out)?;
     measure::write_displacement(&arguments.out, &field)?;
-    let page = reports::displacement_page(&frame, &reference, &field, decoder, &settings)?;
     atomic::write_bytes(&arguments.out.join("report.html"), page.as_bytes())?;
     let summary = processing::field_summary(&field);
     let [u, v, w] = summary.measured_um;

@@ -12,7 +12,18 @@ use std::process::ExitCode;
 
 /// Parses the arguments, runs the command, prints its one answer.
 pub fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => {
+            // help and version are answers, everything else an error; with --json also in that form
+            if error.use_stderr() && std::env::args().any(|argument| argument == "--json") {
+                let text = error.render().to_string();
+                output::print_line(&serde_json::json!({ "error": text.trim(), "exit_code": 2 }).to_string());
+            }
+            error.print().ok();
+            return ExitCode::from(if error.use_stderr() { 2 } else { 0 });
+        }
+    };
     let output = Output::new(cli.json, cli.quiet);
     output.install_error_style();
     match with_threads(cli.threads, || run(&cli.command, &output)) {
@@ -47,13 +58,13 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
 
 /// Runs `work` in a pool of `threads` threads (all cores by default). Results do not depend on it.
 fn with_threads<T: Send>(
-    threads: Option<std::num::NonZeroUsize>,
+    threads: Option<u16>,
     work: impl FnOnce() -> Result<T, Error> + Send,
 ) -> Result<T, Error> {
     let Some(threads) = threads else { return work() };
     let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(threads.get())
+        .num_threads(usize::from(threads))
         .build()
-        .map_err(|error| Error::Threads { threads: threads.get(), reason: error.to_string() })?;
+        .map_err(|error| Error::Threads { threads: usize::from(threads), reason: error.to_string() })?;
     pool.install(work)
 }

@@ -74,20 +74,23 @@ impl Output {
 
     pub fn answer(&self, answer: &Answer) {
         self.bar.finish_and_clear();
-        if self.json {
-            println!("{}", answer.json);
-        } else {
-            println!("{}", answer.text.trim_end());
-        }
+        let text = if self.json { answer.json.to_string() } else { answer.text.clone() };
+        print_line(text.trim_end());
     }
 
     pub fn error(&self, error: &Error) {
         self.bar.finish_and_clear();
         if self.json {
-            println!("{}", json!({ "error": error.to_string(), "exit_code": error.exit_code() }));
+            print_line(&json!({ "error": error.to_string(), "exit_code": error.exit_code() }).to_string());
         }
         eprintln!("{:?}", miette::Report::new(diagnostic::Drawn::of(error)));
     }
+}
+
+/// Prints a line; a reader who has gone (`| head`) has what it wanted.
+pub fn print_line(text: &str) {
+    use std::io::Write as _;
+    writeln!(std::io::stdout(), "{text}").ok();
 }
 
 impl Progress for Output {

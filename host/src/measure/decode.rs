@@ -1,7 +1,8 @@
 //! Pixel pairs to points and displacements, with uncertainty.
 
-use super::{Grid, Match, PointStatus, Tracks};
-use daic_optics::{Decoder, OpticalModel, PixelPair, pixel_covariance};
+use super::{Grid, Match, PointStatus, Tracks, status_counts};
+use crate::error::Error;
+use daic_optics::{Decoded, Decoder, OpticalModel, PixelPair, pixel_covariance};
 use rayon::prelude::*;
 
 /// A gap beyond this many of its own standard deviations is no chance: the match is wrong or the
@@ -32,6 +33,32 @@ pub struct Profile {
     pub points: Vec<ProfilePoint>,
     /// Mean gap of the rays in millimetres: a consistency check that needs no truth.
     pub mean_gap_mm: f64,
+}
+
+impl Profile {
+    /// Refuses a surface without a single point.
+    ///
+    /// # Errors
+    /// [`Error::NothingMeasured`] says what failed.
+    pub fn with_points(self) -> Result<Self, Error> {
+        if self.points.iter().any(|p| p.status.is_ok()) {
+            return Ok(self);
+        }
+        Err(Error::NothingMeasured { reasons: status_counts(self.points.iter().map(|p| p.status)) })
+    }
+}
+
+impl Displacement {
+    /// Refuses a field without a single point.
+    ///
+    /// # Errors
+    /// [`Error::NothingMeasured`] says what failed.
+    pub fn with_points(self) -> Result<Self, Error> {
+        if self.points.iter().any(|p| p.status.is_ok()) {
+            return Ok(self);
+        }
+        Err(Error::NothingMeasured { reasons: status_counts(self.points.iter().map(|p| p.status)) })
+    }
 }
 
 /// One point and its displacement.
@@ -73,9 +100,7 @@ fn point(model: &OpticalModel, decoder: Decoder, matched: &Match) -> ProfilePoin
     let covariance = decoded.covariance_mm2(&pixel_covariance([0.0; 2], matched.sigma_px));
     let sigma = [0, 1, 2].map(|i| covariance[(i, i)].sqrt());
     let p = decoded.point_mm;
-    // across the grooves the gap answers to v alone, on the scale that y has
-    let gap_sigma = decoded.jacobian[(1, 1)].hypot(decoded.jacobian[(1, 3)]) * matched.sigma_px[1].max(0.01);
-    let consistent = decoder != Decoder::Ray || decoded.gap_mm <= GAP_SIGMAS * gap_sigma;
+    let consistent = meets(&decoded, decoder, matched.sigma_px[1]);
     ProfilePoint {
         pixel_px,
         point_mm: [p.x, p.y, p.z],
@@ -83,6 +108,13 @@ fn point(model: &OpticalModel, decoder: Decoder, matched: &Match) -> ProfilePoin
         gap_mm: decoded.gap_mm,
         status: if consistent { PointStatus::Ok } else { PointStatus::Gap },
     }
+}
+
+/// Whether the two rays meet as well as the noise lets them.
+fn meets(decoded: &Decoded, decoder: Decoder, sigma_y_px: f64) -> bool {
+    // across the grooves the gap answers to v alone, on the scale that y has
+    let scale = decoded.jacobian[(1, 1)].hypot(decoded.jacobian[(1, 3)]);
+    decoder != Decoder::Ray || decoded.gap_mm <= GAP_SIGMAS * scale * sigma_y_px.max(0.01)
 }
 
 /// Decodes the matched views of one frame.
@@ -93,13 +125,23 @@ pub fn profile(grid: &Grid, matches: &[Match], model: &OpticalModel, decoder: De
     Profile { grid: grid.clone(), points, mean_gap_mm }
 }
 
+/// Whether a height lies within the range or less than its span outside.
+fn near(h: f64, [low, high]: [f64; 2]) -> bool {
+    let span = high - low;
+    (low - span..=high + span).contains(&h)
+}
+
 /// Decodes matched points before and after; both points belong to the same material (1e).
+///
+/// `height_mm` are the heights between which surfaces are searched; a point that ends up further outside
+/// than their span was followed to the wrong place.
 pub fn displacement(
     grid: &Grid,
     matches: &[Match],
     tracks: &Tracks,
     model: &OpticalModel,
     decoder: Decoder,
+    height_mm: [f64; 2],
 ) -> Displacement {
     let points = matches
         .par_iter()
@@ -119,6 +161,10 @@ pub fn displacement(
             let reference_px2 = pixel_covariance([0.0; 2], matched.sigma_px);
             let tracking_px2 = pixel_covariance(track.sigma_minus_px, track.sigma_plus_px);
             match model.displacement(decoder, matched.pair, deformed, &reference_px2, &tracking_px2) {
+                Ok(found) if !meets(&found.deformed, decoder, track.sigma_plus_px[1]) => {
+                    without(PointStatus::Gap)
+                }
+                Ok(found) if !near(found.deformed.point_mm[2], height_mm) => without(PointStatus::Range),
                 Ok(found) => {
                     let [u, v, w] = [0, 1, 2].map(|i| found.displacement_mm[i]);
                     DisplacementPoint {

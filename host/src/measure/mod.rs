@@ -31,6 +31,8 @@ pub enum PointStatus {
     Decode,
     /// The two rays miss each other by more than their uncertainty explains.
     Gap,
+    /// The point lies far outside the heights that were searched.
+    Range,
 }
 
 impl PointStatus {
@@ -49,8 +51,20 @@ impl std::fmt::Display for PointStatus {
             Self::TrackPlus(reason) => write!(f, "plus:{reason}"),
             Self::Decode => f.write_str("decode"),
             Self::Gap => f.write_str("gap"),
+            Self::Range => f.write_str("range"),
         }
     }
+}
+
+/// How many points have which status, the most frequent first: `22910 ok, 790 match:out_of_image`.
+pub fn status_counts(statuses: impl IntoIterator<Item = PointStatus>) -> String {
+    let mut counts: std::collections::BTreeMap<String, usize> = std::collections::BTreeMap::new();
+    for status in statuses {
+        *counts.entry(status.to_string()).or_default() += 1;
+    }
+    let mut counts: Vec<(String, usize)> = counts.into_iter().collect();
+    counts.sort_by_key(|(name, count)| (std::cmp::Reverse(*count), name.clone()));
+    counts.iter().map(|(name, count)| format!("{count} {name}")).collect::<Vec<_>>().join(", ")
 }
 
 /// Points on the grid of the −1 view: column i, row j at pixel (x0 + i·step, y0 + j·step).

@@ -27,6 +27,8 @@ pub struct Moved {
 /// Moves alone say nothing about d: it only says from where heights are counted. So the height of the
 /// specimen where the optical axis meets it, at the reference position, is the datum.
 ///
+/// `shared` (see [`shared_information`]) is how many points have one independent measurement between them.
+///
 /// # Errors
 /// If the moves do not determine a parameter, or there is no surface near the axis.
 pub fn run(
@@ -34,6 +36,7 @@ pub fn run(
     matches: &[Match],
     moved: &[Moved],
     axis_height_mm: f64,
+    shared: f64,
 ) -> Result<(Optics, CalibrationSummary), Error> {
     let mut displacements = vec![Vector3::zeros()];
     displacements.extend(moved.iter().map(|m| Vector3::from(m.displacement_mm)));
@@ -82,14 +85,14 @@ pub fn run(
             name: unit_name(e.parameter).to_owned(),
             start: e.start,
             value: e.value,
-            sigma: e.sigma,
+            sigma: e.sigma * shared.sqrt(),
         })
         .collect();
     parameters.push(CalibratedParameter {
         name: unit_name(Parameter::GratingToReference).to_owned(),
         start: start.grating_to_reference_mm,
         value: optics.grating_to_reference_mm,
-        sigma: datum_sigma(&found, &model, height_sigma),
+        sigma: datum_sigma(&found, &model, height_sigma) * shared.sqrt(),
     });
     let summary = CalibrationSummary {
         parameters,
@@ -100,6 +103,22 @@ pub fn run(
         rejected: found.rejected.len(),
     };
     Ok((optics, summary))
+}
+
+/// Overlapping subsets see the same pixels: how many points of a grid have one independent measurement
+/// between them.
+///
+/// A first-order subset averages over its whole area, so neighbours closer than its side share their noise:
+/// (subset/step)² of them. The estimate of a second-order one rests on its middle: its kernel's noise is
+/// 1 + 5/4 + 5/4 = 3.5 times that of the mean over the square (the constant beside x² and y²), and shared by
+/// so many times fewer points.
+pub fn shared_information(settings: &measure::Settings) -> f64 {
+    let ratio = settings.dic.subset as f64 / settings.step as f64;
+    let narrower = match settings.dic.shape {
+        daic_correlate::Shape::Quadratic => 3.5,
+        _ => 1.0,
+    };
+    (ratio * ratio / narrower).max(1.0)
 }
 
 fn observation(pair: PixelPair, minus: [f64; 2], plus: [f64; 2]) -> Observation {

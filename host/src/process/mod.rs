@@ -8,8 +8,8 @@ mod report;
 mod summary;
 
 pub use summary::{
-    CalibratedParameter, CalibrationSummary, Check, FieldSummary, FrameCounts, FrameSummary, ProfileSummary,
-    Summary,
+    CalibratedParameter, CalibrationSummary, Check, FailedFrame, FieldSummary, FrameCounts, FrameSummary,
+    ProfileSummary, Summary,
 };
 
 use crate::error::Error;
@@ -46,8 +46,8 @@ struct ReferenceResult {
 pub struct Processed {
     /// The numbers, as in `summary.json`.
     pub summary: Summary,
-    /// What could not be read of the dataset.
-    pub damage: Vec<Damage>,
+    /// Wall time of a demo that the dataset's old summary knew.
+    pub wall_s: Option<f64>,
     /// Frames whose results were there already.
     pub resumed: usize,
 }
@@ -62,13 +62,12 @@ pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Proc
     let dataset = Dataset::open(root)?;
     let experiment_path = root.join("experiment.toml");
     let experiment = Experiment::parse(&dataset.experiment_toml()?, &experiment_path)?;
-    let contents = dataset.frames()?;
-    let mut damage = contents.damage;
-    damage.extend(dataset.events()?.damage);
-    let paired: Vec<&FrameRecord> =
-        contents.records.iter().filter(|f| f.verdict == Verdict::Paired).collect();
-    let reference_record = reference_of(&contents.records)
-        .ok_or_else(|| Error::NoPairedFrame { root: root.to_owned(), frames: contents.records.len() })?;
+    let wall_s =
+        dataset.summary::<serde_json::Value>().ok().flatten().and_then(|s| s.get("wall_s")?.as_f64());
+    let (records, damage) = judged(&dataset, &experiment)?;
+    let paired: Vec<&FrameRecord> = records.iter().filter(|f| f.verdict == Verdict::Paired).collect();
+    let reference_record = reference_of(&records)
+        .ok_or_else(|| Error::NoPairedFrame { root: root.to_owned(), frames: records.len() })?;
 
     let settings = crate::settings::measure_settings(&experiment.processing);
     let mut run = Run {
@@ -80,17 +79,24 @@ pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Proc
         fresh,
         progress,
         resumed: 0,
+        failed: Vec::new(),
     };
     let start = optics_section::from_section(&experiment.optics)?;
     let (optics, calibration) = run.calibrated(&paired, &start)?;
     write_optics(&dataset.results(), &experiment, &optics, calibration.as_ref())?;
     let reference = run.profile(&optics)?;
     let mut measured = Vec::new();
-    for record in &paired {
-        if record.role == FrameRole::Measurement {
-            measured.push(run.displacement(record, &optics)?);
+    for record in paired.iter().filter(|r| r.role == FrameRole::Measurement) {
+        match run.displacement(record, &optics) {
+            Ok(result) => measured.push(result),
+            // one bad frame does not stop a series
+            Err(error @ (Error::Dataset(_) | Error::NothingMeasured { .. } | Error::Correlate(_))) => {
+                run.failed.push(failed(record, &error));
+            }
+            Err(error) => return Err(error),
         }
     }
+    let failed = std::mem::take(&mut run.failed);
     let resumed = run.resumed;
 
     let (edge_error, edges_compared) = edge_error(&dataset)?;
@@ -98,7 +104,7 @@ pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Proc
     let summary = Summary {
         daic: env!("CARGO_PKG_VERSION").to_owned(),
         seed: dataset.manifest().seed,
-        frames: count(&contents.records),
+        frames: count(&records),
         commanded_um: last.and_then(|f| f.commanded_um),
         measured_um: last.map(|f| f.field.measured_um),
         rms_um: last.and_then(|f| f.rms_um),
@@ -108,11 +114,41 @@ pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Proc
         calibration,
         profile: reference.profile,
         measured,
+        failed,
+        damage: damage.iter().map(Damage::to_string).collect(),
     };
     dataset.write_summary(&summary)?;
     progress.stage("writing the report", 0);
     write_report(&dataset, &summary, None)?;
-    Ok(Processed { summary, damage, resumed })
+    Ok(Processed { summary, wall_s, resumed })
+}
+
+/// The frames with their verdicts. Where the recording was interrupted before it judged them, or its last lines are
+/// torn, they are judged now, from the events and the frames' own times.
+fn judged(dataset: &Dataset, experiment: &Experiment) -> Result<(Vec<FrameRecord>, Vec<Damage>), Error> {
+    let contents = dataset.frames()?;
+    let events = dataset.events()?;
+    let (mut records, mut damage) = (contents.records, contents.damage);
+    damage.extend(events.damage);
+    if records.iter().any(|r| r.verdict == Verdict::Pending) {
+        let manifest = dataset.manifest();
+        let mask = daic_protocol::channels::camera(experiment.rig.camera.line).unwrap_or(0);
+        let tick_hz = manifest.tick_hz.map_or(daic_protocol::limits::TICK_HZ, |hz| hz as u32);
+        let exposure_ns = crate::recording::exposure_ns(experiment);
+        crate::verdicts::from_events(
+            &mut records,
+            &events.records,
+            &manifest.plan,
+            mask,
+            tick_hz,
+            exposure_ns,
+        )?;
+    }
+    Ok((records, damage))
+}
+
+fn failed(record: &FrameRecord, error: &Error) -> FailedFrame {
+    FailedFrame { id: record.id, name: record.name.clone(), reason: format!("{}: {error}", record.name) }
 }
 
 /// Writes `report.html` of a dataset that has been measured, and its figures to `results/figures`;
@@ -160,6 +196,7 @@ struct Run<'a> {
     fresh: bool,
     progress: &'a dyn Progress,
     resumed: usize,
+    failed: Vec<FailedFrame>,
 }
 
 /// What `results/calibration.json` holds.
@@ -183,8 +220,12 @@ impl Run<'_> {
     }
 
     fn key(&self, optics: &Optics, records: &[&FrameRecord]) -> Result<String, Error> {
-        let files: Vec<_> =
-            records.iter().filter_map(|r| Some(self.dataset.root().join(r.file.as_ref()?))).collect();
+        let files: Vec<_> = records
+            .iter()
+            .filter_map(|r| Some(self.dataset.root().join(r.file.as_ref()?)))
+            // a file that is gone has its own error where it is read
+            .filter(|file| file.exists())
+            .collect();
         let settings =
             (&self.experiment.processing, optics, records.iter().map(|r| r.commanded_um).collect::<Vec<_>>());
         Ok(result_key(env!("CARGO_PKG_VERSION"), &settings, &files)?)
@@ -222,15 +263,23 @@ impl Run<'_> {
         }
         let mut moved = Vec::new();
         for (record, move_um) in frames {
-            let image = self.dataset.read_frame(record)?;
+            let image = match self.dataset.read_frame(record) {
+                Ok(image) => image,
+                // the other moves may still determine everything; if not, the calibration says so
+                Err(error) => {
+                    self.failed.push(failed(record, &error.into()));
+                    continue;
+                }
+            };
             let progress = self.progress;
             let tracks = self.reference()?.track(&image, progress)?;
             moved.push(calibration::Moved { displacement_mm: move_um.map(|um| um * 1e-3), tracks });
         }
         self.progress.stage("calibrating", 0);
         let axis_height_mm = self.experiment.processing.axis_height.mm();
+        let shared = calibration::shared_information(&self.settings);
         let matches = &self.reference()?.matches;
-        let (optics, summary) = calibration::run(start, matches, &moved, axis_height_mm)?;
+        let (optics, summary) = calibration::run(start, matches, &moved, axis_height_mm, shared)?;
         write_json(&path, &StoredCalibration { key, summary: summary.clone(), optics })?;
         Ok((optics, Some(summary)))
     }
@@ -249,7 +298,7 @@ impl Run<'_> {
         let model = OpticalModel::new(optics)?;
         let decoder = crate::settings::decoder(self.experiment.processing.decoder);
         let reference = self.reference()?;
-        let profile = measure::profile(&reference.grid, &reference.matches, &model, decoder);
+        let profile = measure::profile(&reference.grid, &reference.matches, &model, decoder).with_points()?;
         let corners = |r: measure::Rectangle| [r.x, r.y, r.width, r.height];
         let result = ReferenceResult {
             profile: profile_summary(&profile),
@@ -277,11 +326,18 @@ impl Run<'_> {
         let model = OpticalModel::new(optics)?;
         let decoder = crate::settings::decoder(self.experiment.processing.decoder);
         let commanded_um = self.moved_um(record);
-        let progress = self.progress;
+        let (progress, settings) = (self.progress, self.settings.clone());
         let reference = self.reference()?;
         let tracks = reference.track(&image, progress)?;
-        let displacement =
-            measure::displacement(&reference.grid, &reference.matches, &tracks, &model, decoder);
+        let displacement = measure::displacement(
+            &reference.grid,
+            &reference.matches,
+            &tracks,
+            &model,
+            decoder,
+            settings.height_mm,
+        )
+        .with_points()?;
         let result = frame_summary(record, commanded_um, &displacement);
         let directory = self.dataset.begin_results(record.id)?;
         measure::write_displacement(&directory, &displacement)?;

@@ -21,7 +21,7 @@ pub fn report(
     summary: &Summary,
     checks: Option<&[Check]>,
 ) -> Result<Report, Error> {
-    let records = dataset.frames()?.records;
+    let (records, _) = super::judged(dataset, experiment)?;
     let no_frame = || Error::NoPairedFrame { root: dataset.root().to_owned(), frames: records.len() };
     let reference_record = super::reference_of(&records).ok_or_else(no_frame)?;
     let result = dataset.frame_results(reference_record.id).join("result.json");

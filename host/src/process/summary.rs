@@ -32,6 +32,10 @@ pub struct Summary {
     pub profile: ProfileSummary,
     /// Every measured frame, in the order of the dataset.
     pub measured: Vec<FrameSummary>,
+    /// Paired frames that could not be measured.
+    pub failed: Vec<FailedFrame>,
+    /// What could not be read of the dataset.
+    pub damage: Vec<String>,
 }
 
 /// Frames by verdict.
@@ -45,6 +49,17 @@ pub struct FrameCounts {
     pub extra: usize,
     /// Frames that fit more than one trigger.
     pub ambiguous: usize,
+}
+
+/// A frame that could not be measured.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FailedFrame {
+    /// Number of the frame in the dataset.
+    pub id: u64,
+    /// Name in the experiment.
+    pub name: String,
+    /// Why.
+    pub reason: String,
 }
 
 /// A calibration in numbers.

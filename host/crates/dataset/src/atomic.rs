@@ -10,6 +10,12 @@ use thiserror::Error;
 /// Why a file could not be written.
 #[derive(Debug, Error)]
 pub enum WriteError {
+    /// The path names a folder; nothing was written.
+    #[error("{} is a folder; give a file name", path.display())]
+    IsFolder {
+        /// The path.
+        path: PathBuf,
+    },
     /// The folder that should hold the file could not be made or written into.
     #[error("cannot create a temporary file in folder {}: {source}", dir.display())]
     Folder {
@@ -56,6 +62,9 @@ pub fn write_bytes_synced(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
 }
 
 fn replace(path: &Path, bytes: &[u8], sync: bool) -> Result<(), WriteError> {
+    if path.is_dir() {
+        return Err(WriteError::IsFolder { path: path.to_path_buf() });
+    }
     let dir = match path.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
@@ -106,7 +115,8 @@ mod tests {
         fs::create_dir(&path).unwrap();
         fs::write(path.join("x"), b"x").unwrap();
         let error = write_bytes(&path, b"y").unwrap_err();
-        assert!(matches!(error, WriteError::Rename { .. }), "{error}");
+        assert!(matches!(error, WriteError::IsFolder { .. }), "{error}");
+        assert!(error.to_string().ends_with("taken is a folder; give a file name"), "{error}");
         assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
         let error = write_bytes(&path.join("x").join("z"), b"y").unwrap_err();
         assert!(matches!(error, WriteError::Folder { .. }), "{error}");

@@ -175,7 +175,18 @@ fn lost_events_and_files_are_reported() {
     let set = recording.finish().unwrap();
     assert_eq!(set.events().unwrap().damage, [Damage::EventGap { expected: 5, found: 7 }]);
     fs::remove_file(root.join("frames/000000.tif")).unwrap();
-    assert!(matches!(set.frames().unwrap().damage[..], [Damage::FrameFileGone { id: 0, .. }]));
+    let frames = set.frames().unwrap();
+    assert!(matches!(frames.damage[..], [Damage::FrameFileGone { id: 0, .. }]));
+    let listed = serde_json::to_value(&frames.damage).unwrap();
+    assert_eq!(listed, serde_json::json!([frames.damage[0].to_string()]));
+    assert!(frames.damage[0].to_string().contains("restore the file to measure it"));
+    let error = set.read_frame(&frames.records[0]).unwrap_err();
+    assert!(matches!(error, DatasetError::FrameGone { id: 0, .. }), "{error}");
+    assert!(error.to_string().contains("check that the dataset is complete"), "{error}");
+    fs::remove_file(root.join("experiment.toml")).unwrap();
+    let error = set.experiment_toml().unwrap_err();
+    assert!(matches!(error, DatasetError::Experiment { .. }), "{error}");
+    assert!(error.to_string().contains("check that the dataset is complete"), "{error}");
     fs::remove_file(root.join("events.jsonl")).unwrap();
     assert!(matches!(set.events().unwrap().damage[..], [Damage::JournalGone { .. }]));
 }
@@ -195,7 +206,7 @@ fn foreign_folders_and_newer_versions_are_refused() {
     assert!(matches!(Dataset::open(&foreign.join("thesis.tex")), Err(DatasetError::NotADataset { .. })));
     // Somebody else's dataset.json does not make it ours.
     fs::write(foreign.join("dataset.json"), "{\"name\": \"other tool\"}").unwrap();
-    assert!(matches!(create(&foreign, Existing::Replace), Err(DatasetError::NotADataset { .. })));
+    assert!(matches!(create(&foreign, Existing::Replace), Err(DatasetError::NotEmpty { .. })));
     assert!(matches!(create(&foreign, Existing::Refuse), Err(DatasetError::AlreadyThere { .. })));
     assert_eq!(fs::read_to_string(foreign.join("thesis.tex")).unwrap(), "years of work");
 
@@ -224,6 +235,64 @@ fn foreign_folders_and_newer_versions_are_refused() {
 }
 
 #[test]
+fn a_folder_with_an_unreadable_manifest_is_not_cleared() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("theirs");
+    for sub in ["results", "frames"] {
+        fs::create_dir_all(root.join(sub)).unwrap();
+        fs::write(root.join(sub).join("precious.dat"), "1").unwrap();
+    }
+    fs::write(root.join("summary.json"), "{}").unwrap();
+    let before = entries(&root);
+    // No JSON, torn JSON, another type of JSON, and ours but without its fields.
+    for text in ["not json", "{\"format\":\"daic-da", "[1, 2]", "{\"format\":\"daic-dataset\"}"] {
+        fs::write(root.join("dataset.json"), text).unwrap();
+        for existing in [Existing::Replace, Existing::ReplaceKind("demo")] {
+            let error = Dataset::create(&root, manifest(), "", existing).unwrap_err();
+            assert!(
+                matches!(error, DatasetError::NotReplaced { .. } | DatasetError::NotEmpty { .. }),
+                "{text}: {error}"
+            );
+            assert!(error.to_string().contains("choose a"), "{error}");
+        }
+        fs::remove_file(root.join("dataset.json")).unwrap();
+        assert_eq!(entries(&root), before, "{text}");
+        assert!(root.join("results/precious.dat").is_file() && root.join("frames/precious.dat").is_file());
+    }
+}
+
+#[test]
+fn only_a_dataset_of_the_kind_is_replaced() {
+    let dir = tempfile::tempdir().unwrap();
+    let demo = Existing::ReplaceKind("demo");
+    let recorded = dir.path().join("recorded");
+    record(&recorded, 2);
+    let error = Dataset::create(&recorded, manifest(), "", demo).unwrap_err();
+    assert!(matches!(&error, DatasetError::OtherKind { kind: None, wanted: "demo", .. }), "{error}");
+    assert!(
+        error.to_string().contains("holds a recorded dataset")
+            && error.to_string().contains("choose another folder"),
+        "{error}"
+    );
+    assert_eq!(Dataset::open(&recorded).unwrap().frames().unwrap().records.len(), 2);
+
+    // What was made as this kind is of this kind, and is replaced the next time.
+    let ours = dir.path().join("ours");
+    for _ in 0..2 {
+        let mut recording = Dataset::create(&ours, manifest(), "", demo).unwrap();
+        assert_eq!(recording.dataset().frames().unwrap().records, []);
+        recording.append_frame(frame(0), None).unwrap();
+    }
+    assert_eq!(Dataset::open(&ours).unwrap().manifest().kind.as_deref(), Some("demo"));
+    let error = Dataset::create(&ours, manifest(), "", Existing::ReplaceKind("test")).unwrap_err();
+    assert!(matches!(&error, DatasetError::OtherKind { kind: Some(k), .. } if k == "demo"), "{error}");
+    assert!(matches!(
+        Dataset::create(&ours, manifest(), "", Existing::Refuse),
+        Err(DatasetError::AlreadyThere { .. })
+    ));
+}
+
+#[test]
 fn results_are_done_only_for_the_same_settings_and_inputs() {
     let dir = tempfile::tempdir().unwrap();
     let root = dir.path().join("set");
@@ -236,6 +305,20 @@ fn results_are_done_only_for_the_same_settings_and_inputs() {
     assert!(!set.is_done(1, &key));
     set.mark_done(1, &key).unwrap();
     assert!(set.is_done(1, &key) && !set.is_done(0, &key));
+    // A file that is gone, or has another length, has to be computed again.
+    fs::remove_file(folder.join("points.csv")).unwrap();
+    assert!(!set.is_done(1, &key));
+    fs::write(folder.join("points.csv"), "x").unwrap();
+    assert!(!set.is_done(1, &key));
+    fs::write(folder.join("points.csv"), "x\n").unwrap();
+    fs::write(folder.join("more.txt"), "of the user").unwrap();
+    assert!(set.is_done(1, &key));
+    // Marks without the list of files prove nothing.
+    let mark = fs::read(folder.join("done.json")).unwrap();
+    fs::write(folder.join("done.json"), format!("{{\"key\": \"{key}\"}}")).unwrap();
+    assert!(!set.is_done(1, &key));
+    fs::write(folder.join("done.json"), mark).unwrap();
+    assert!(set.is_done(1, &key));
     let other = |version: &str, subset: u32, inputs: &[std::path::PathBuf]| {
         result_key(version, &serde_json::json!({"subset": subset}), inputs).unwrap()
     };

@@ -19,10 +19,19 @@ impl Ticks {
         if !(span.is_finite() && span > 0.0) {
             return Ticks { values: if low.is_finite() { vec![low] } else { vec![] }, step: 1.0 };
         }
-        let most = most.max(2) as f64;
-        let mut step = 10f64.powf((span / most).log10().floor());
-        let factors = [1.0, 2.0, 5.0, 10.0, 20.0];
-        if let Some(f) = factors.iter().find(|&f| span / (step * f) <= most - 1.0 + 1e-9) {
+        Self::spaced(low, high, span / (most.max(2) as f64 - 1.0))
+    }
+
+    /// Round values from `low` to `high`, the least round step of at least `least` apart.
+    #[must_use]
+    pub fn spaced(low: f64, high: f64, least: f64) -> Self {
+        let valid = low.is_finite() && high > low && high.is_finite() && least > 0.0 && least.is_finite();
+        if !valid {
+            return Ticks { values: if low.is_finite() { vec![low] } else { vec![] }, step: 1.0 };
+        }
+        let mut step = 10f64.powf(least.log10().floor());
+        let factors = [1.0, 2.0, 5.0, 10.0];
+        if let Some(f) = factors.iter().find(|&f| step * f >= least * (1.0 - 1e-9)) {
             step *= f;
         }
         // Multiples of the step, not sums: sums drift off the round values.
@@ -67,6 +76,14 @@ mod tests {
         let t = Ticks::between(-2e-9, 2e-9, 5);
         assert_eq!(t.label(t.values[0]), "−2e−9");
         assert_eq!(t.label(t.values[2]), "0");
+    }
+
+    #[test]
+    fn steps_are_the_least_round_ones_that_keep_the_distance() {
+        assert_eq!(Ticks::spaced(0.0, 4.2, 1.1).values, [0.0, 2.0, 4.0]);
+        assert_eq!(Ticks::spaced(0.0, 700.0, 200.0).values, [0.0, 200.0, 400.0, 600.0]);
+        assert_eq!(Ticks::spaced(0.0, 700.0, 201.0).values, [0.0, 500.0]);
+        assert_eq!(Ticks::spaced(0.0, 1.0, f64::NAN).values, [0.0]);
     }
 
     #[test]

@@ -58,6 +58,19 @@ const WIDTH: f64 = 760.0;
 /// More windows than this are not drawn: the figure says how many are left out.
 const MOST_WINDOWS: usize = 12;
 
+/// Least distance of tick labels in a window. Round steps are up to 2.5 times as far apart, so
+/// that the narrowest window (130 px as a rule) has two labels at least.
+const LABEL: f64 = 36.0;
+
+/// How times are told below the rows.
+#[derive(Clone, Copy)]
+struct TimeAxis {
+    /// Tick counted as 0.
+    zero: f64,
+    /// Name of the unit, and how many make a second.
+    unit: (&'static str, f64),
+}
+
 /// A piece of the time axis on the drawing.
 struct Span {
     from: f64,
@@ -122,7 +135,9 @@ impl Timeline {
                 &format!("{number}"),
             );
         }
-        self.axis(&mut svg, &all, overview_top, rows, 0.0, 9);
+        let s = |tick: f64| tick / self.tick_hz;
+        let time = TimeAxis { zero: 0.0, unit: time_unit(s(all.to).abs().max(s(all.from).abs())) };
+        self.axis(&mut svg, &all, overview_top, rows, &time, all.w / 8.0);
         self.rows(&mut svg, &all, overview_top);
         self.names(&mut svg, overview_top);
 
@@ -139,12 +154,15 @@ impl Timeline {
         let note = format!("windows to one scale, time between them left out{note}");
         svg.text(LEFT, top - 26.0, SMALL, Anchor::Start, &note);
         self.names(svg, top);
+        // One unit for all headings and one for all axes: windows are there to be compared.
+        let longest = windows.iter().map(|w| self.seconds(w.1 - w.0)).fold(0.0, f64::max);
+        let latest = windows.iter().map(|w| self.seconds(w.0)).fold(0.0, f64::max);
         for (number, (span, window)) in spans.iter().zip(windows).enumerate() {
-            let start = self.seconds(window.0);
-            let label = format!("{} at {}", number + 1, duration(start));
+            let label = format!("{} at {}", number + 1, moment(self.seconds(window.0), time_unit(latest)));
             svg.text(span.x, top - 8.0, SMALL, Anchor::Start, &label);
             svg.rect(span.x, top, span.w, rows, "fill=\"currentColor\" fill-opacity=\"0.05\"");
-            self.axis(svg, span, top, rows, window.0 as f64, (span.w / 42.0) as usize);
+            let time = TimeAxis { zero: window.0 as f64, unit: time_unit(longest) };
+            self.axis(svg, span, top, rows, &time, LABEL.max(span.w / 10.0));
             self.rows(svg, span, top);
         }
         for (pair, times) in spans.windows(2).zip(windows.windows(2)) {
@@ -169,11 +187,11 @@ impl Timeline {
         ticks as f64 / self.tick_hz
     }
 
-    /// Time ticks below the rows, counted from `zero`.
-    fn axis(&self, svg: &mut Svg, span: &Span, top: f64, rows: f64, zero: f64, most: usize) {
-        let s = |tick: f64| (tick - zero) / self.tick_hz;
-        let (unit, factor) = time_unit(s(span.to).abs().max(s(span.from).abs()));
-        let ticks = Ticks::between(s(span.from) * factor, s(span.to) * factor, most.clamp(2, 10));
+    /// Time ticks below the rows, at least `apart` pixels from each other.
+    fn axis(&self, svg: &mut Svg, span: &Span, top: f64, rows: f64, time: &TimeAxis, apart: f64) {
+        let (TimeAxis { zero, unit: (unit, factor) }, hz) = (*time, self.tick_hz);
+        let (low, high) = ((span.from - zero) / hz * factor, (span.to - zero) / hz * factor);
+        let ticks = Ticks::spaced(low, high, (high - low) * apart / span.w);
         let bottom = top + rows;
         svg.line(
             (span.x, bottom),
@@ -181,7 +199,7 @@ impl Timeline {
             "stroke=\"currentColor\" stroke-opacity=\"0.6\"",
         );
         for &value in &ticks.values {
-            let x = span.at(value / factor * self.tick_hz + zero);
+            let x = span.at(value / factor * hz + zero);
             svg.line((x, top), (x, bottom), GRID);
             svg.line((x, bottom), (x, bottom + 4.0), "stroke=\"currentColor\" stroke-opacity=\"0.6\"");
             svg.text(x, bottom + 16.0, SMALL, Anchor::Middle, &ticks.label(value));
@@ -347,6 +365,12 @@ fn time_unit(seconds: f64) -> (&'static str, f64) {
         s if s >= 1e-6 => ("µs", 1e6),
         _ => ("ns", 1e9),
     }
+}
+
+/// A time in the unit given, to the microsecond or finer.
+fn moment(seconds: f64, (unit, factor): (&str, f64)) -> String {
+    let decimals = if factor > 1.0 { 3 } else { 6 };
+    format!("{:.decimals$} {unit}", seconds * factor)
 }
 
 fn duration(seconds: f64) -> String {

@@ -262,6 +262,43 @@ fn timeline_draws_pulses_at_their_ticks() {
 }
 
 #[test]
+fn every_window_of_a_timeline_has_labels_in_common_units() {
+    // Texts below the rows of the windows, between the edges of each: windows are laid out from
+    // x = 150 on with 34 px between them.
+    for length_us in [1.0, 3.0, 7.0, 42.0, 210.0, 300.0, 700.0, 1999.0, 2100.0, 4200.0, 9000.0, 420_000.0] {
+        for count in 1..=12u32 {
+            let mut timeline = timeline();
+            timeline.title = "t".into();
+            let ticks = (length_us * 125.0) as u64;
+            timeline.windows = (0..u64::from(count))
+                .map(|i| (225_000 + i * 3 * ticks, 225_000 + i * 3 * ticks + ticks))
+                .collect();
+            let svg = timeline.render_svg().unwrap();
+            let texts = check_xml(svg.as_str());
+            let zeros: Vec<usize> = (0..texts.len())
+                .filter(|&i| {
+                    texts[i].trim_start_matches('0').trim_start_matches('.').trim_matches('0').is_empty()
+                })
+                .filter(|&i| texts[i].starts_with('0'))
+                .collect();
+            assert_eq!(zeros.len(), count as usize + 1, "{length_us} µs, {count}: {texts:?}");
+            for &zero in &zeros[1..] {
+                let next: f64 =
+                    texts[zero + 1..].iter().find(|t| !t.trim().is_empty()).unwrap().parse().unwrap_or(0.0);
+                assert!(next > 0.0, "{length_us} µs, {count}: one label only: {texts:?}");
+            }
+            let units: std::collections::BTreeSet<&str> =
+                texts.iter().filter(|t| t.contains(" at ")).map(|t| t.rsplit(' ').next().unwrap()).collect();
+            assert_eq!(units.len(), 1, "{units:?}");
+        }
+    }
+    let mut two = timeline();
+    two.windows = vec![(225_000, 300_000), (61_475_875, 61_550_875)];
+    let svg = two.render_svg().unwrap();
+    assert!(svg.as_str().contains("1 at 1.800 ms") && svg.as_str().contains("2 at 491.807 ms"));
+}
+
+#[test]
 fn wrong_shapes_are_errors() {
     assert!(matches!(heatmap(3, 2, vec![0.0; 5]).render_svg(), Err(ReportError::Shape { .. })));
     assert!(matches!(heatmap(0, 0, vec![]).render_png(), Err(ReportError::Shape { .. })));

@@ -25,6 +25,17 @@ pub enum RigError {
     /// The camera, while frames were fetched.
     #[error(transparent)]
     Frame(#[from] FrameError),
+    /// A frame of another size than the camera or the experiment says.
+    #[error(
+        "a frame has {} × {} pixels, not {} × {}; set width and height of [rig.camera] to those of the frames, or give the right frames",
+        found[0], found[1], expected[0], expected[1]
+    )]
+    FrameSize {
+        /// Columns and rows of the frame.
+        found: [u32; 2],
+        /// Columns and rows that it should have.
+        expected: [u32; 2],
+    },
     /// The box is busy.
     #[error("the box is {}: another run has not ended; wait for it, or stop it", state_name(*state))]
     NotReady {
@@ -94,7 +105,7 @@ impl RigError {
     /// Whether the input is to blame (exit code 2) rather than the rig (exit code 3).
     pub fn is_input(&self) -> bool {
         match self {
-            Self::Config(_) | Self::Compile(_) | Self::Sink { .. } => true,
+            Self::Config(_) | Self::Compile(_) | Self::FrameSize { .. } | Self::Sink { .. } => true,
             Self::Link(e) => e.is_input(),
             Self::Camera(e) => matches!(e, CameraError::Setting { .. }),
             Self::Frame(_)

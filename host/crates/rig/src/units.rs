@@ -1,7 +1,8 @@
 //! Quantities as they are written in files: a number and its unit, `"633 nm"`.
 //!
 //! Each quantity is a newtype over one `f64` in one base unit, named by its accessor. A plain
-//! number, a unit of another quantity, NaN and infinity are refused. `µ` (either code point) and
+//! number, a unit of another quantity, NaN, and numbers beyond any rig (±1e12 in the base unit, times
+//! ±1e15 ns) are refused. `µ` (either code point) and
 //! `u` mean the same, `²` and `^2` too.
 
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
@@ -62,13 +63,15 @@ pub enum UnitError {
         /// Units that are understood.
         allowed: String,
     },
-    /// The number is too large to be held.
-    #[error("{found:?} is not a finite number; write {kind} such as \"{example}\"")]
-    NotFinite {
+    /// The number is beyond any rig, or infinite.
+    #[error("{found} is out of range: {kind} is within ±{limit}; write it such as \"{example}\"")]
+    OutOfRange {
         /// Which quantity was wanted.
         kind: &'static str,
-        /// The text found.
+        /// The value found, in short.
         found: String,
+        /// Largest size allowed.
+        limit: String,
         /// How to write it.
         example: &'static str,
     },
@@ -91,6 +94,8 @@ struct Kind {
     /// With its article, as in "a length".
     name: &'static str,
     example: &'static str,
+    /// Largest size in the base unit.
+    limit: f64,
     /// The base unit comes first.
     units: &'static [Unit],
 }
@@ -128,10 +133,12 @@ impl Kind {
             allowed: self.allowed(),
         })?;
         let base = value * unit.multiply / unit.divide;
-        if base.is_finite() {
+        // Also false for infinity.
+        if base.abs() <= self.limit {
             Ok(base)
         } else {
-            Err(UnitError::NotFinite { kind, found: text.to_owned(), example })
+            let limit = format!("{:e} {}", self.limit, self.units.first().map_or("", |u| u.symbol));
+            Err(UnitError::OutOfRange { kind, found: format!("{value:.3e} {}", unit.symbol), limit, example })
         }
     }
 
@@ -174,13 +181,13 @@ fn normalise(symbol: &str) -> String {
 }
 
 macro_rules! quantity {
-    ($(#[$doc:meta])* $name:ident, $accessor:ident, $base:literal, $kind:literal, $example:literal, [$($unit:expr),+ $(,)?]) => {
+    ($(#[$doc:meta])* $name:ident, $accessor:ident, $base:literal, $kind:literal, $example:literal, $limit:literal, [$($unit:expr),+ $(,)?]) => {
         $(#[$doc])*
         #[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
         pub struct $name(f64);
 
         impl $name {
-            const KIND: Kind = Kind { name: $kind, example: $example, units: &[$($unit),+] };
+            const KIND: Kind = Kind { name: $kind, example: $example, limit: $limit, units: &[$($unit),+] };
 
             #[doc = concat!("From a value in ", $base, ".")]
             pub const fn new(value: f64) -> Self {
@@ -202,7 +209,14 @@ macro_rules! quantity {
         impl fmt::Display for $name {
             /// Base unit, shortest digits that give the same value again.
             fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                write!(f, "{} {}", self.0, Self::KIND.units[0].symbol)
+                let unit = Self::KIND.units[0].symbol;
+                let size = self.0.abs();
+                // Else a tiny or huge number would be hundreds of digits long.
+                if size == 0.0 || (1e-9..1e15).contains(&size) {
+                    write!(f, "{} {unit}", self.0)
+                } else {
+                    write!(f, "{:e} {unit}", self.0)
+                }
             }
         }
 
@@ -258,22 +272,22 @@ impl Visitor<'_> for QuantityVisitor {
 
 quantity!(
     /// A length; base unit millimetre.
-    Length, mm, "millimetres", "a length", "307 mm",
+    Length, mm, "millimetres", "a length", "307 mm", 1e12,
     [unit("mm", 1.0, 1.0), unit("nm", 1.0, 1e6), unit("um", 1.0, 1e3), unit("cm", 10.0, 1.0), unit("m", 1e3, 1.0)]
 );
 quantity!(
     /// A time; base unit nanosecond.
-    Time, ns, "nanoseconds", "a time", "20 ms",
+    Time, ns, "nanoseconds", "a time", "20 ms", 1e15,
     [unit("ns", 1.0, 1.0), unit("us", 1e3, 1.0), unit("ms", 1e6, 1.0), unit("s", 1e9, 1.0), unit("min", 6e10, 1.0)]
 );
 quantity!(
     /// A length on the sensor; base unit pixel.
-    Pixels, px, "pixels", "a length on the sensor", "17956.2 px",
+    Pixels, px, "pixels", "a length on the sensor", "17956.2 px", 1e12,
     [unit("px", 1.0, 1.0)]
 );
 quantity!(
     /// An angle; base unit radian.
-    Angle, rad, "radians", "an angle", "1.5 mrad",
+    Angle, rad, "radians", "an angle", "1.5 mrad", 1e12,
     [
         unit("rad", 1.0, 1.0),
         unit("urad", 1.0, 1e6),
@@ -283,17 +297,17 @@ quantity!(
 );
 quantity!(
     /// A number per length, such as the lines of a grating; base unit per millimetre.
-    PerLength, per_mm, "counts per millimetre", "a number per length", "300 /mm",
+    PerLength, per_mm, "counts per millimetre", "a number per length", "300 /mm", 1e12,
     [unit("/mm", 1.0, 1.0), unit("/um", 1e3, 1.0), unit("/cm", 1.0, 10.0), unit("/m", 1.0, 1e3)]
 );
 quantity!(
     /// A speed; base unit millimetre per second.
-    Speed, mm_per_s, "millimetres per second", "a speed", "5 mm/s",
+    Speed, mm_per_s, "millimetres per second", "a speed", "5 mm/s", 1e12,
     [unit("mm/s", 1.0, 1.0), unit("um/s", 1.0, 1e3), unit("cm/s", 10.0, 1.0), unit("m/s", 1e3, 1.0)]
 );
 quantity!(
     /// An acceleration; base unit millimetre per second squared.
-    Acceleration, mm_per_s2, "millimetres per second squared", "an acceleration", "50 mm/s^2",
+    Acceleration, mm_per_s2, "millimetres per second squared", "an acceleration", "50 mm/s^2", 1e12,
     [unit("mm/s^2", 1.0, 1.0), unit("um/s^2", 1.0, 1e3), unit("m/s^2", 1e3, 1.0)]
 );
 
@@ -351,7 +365,17 @@ mod tests {
         assert!(message("mm").contains("does not start with a number"));
         assert!(message("").contains("does not start with a number"));
         assert!(message("1,5 mm").contains("\",5mm\""), "{}", message("1,5 mm"));
-        assert!(message("1e400 mm").contains("not a finite number"));
+        for (text, found) in
+            [("633e300 nm", "6.330e302 nm"), ("1e400 mm", "inf mm"), ("-1.1e12 mm", "-1.100e12 mm")]
+        {
+            assert_eq!(
+                message(text),
+                format!("{found} is out of range: a length is within ±1e12 mm; write it such as \"307 mm\"")
+            );
+        }
+        assert_eq!(message(&format!("1{} nm", "0".repeat(300))), message("1e300 nm"));
+        assert_eq!(Length::new(1e300).to_string(), "1e300 mm");
+        assert!("24 min".parse::<Time>().is_ok() && "1e7 s".parse::<Time>().is_err());
         assert!(message("nan mm").contains("does not start with a number"));
         assert!(message("inf mm").contains("does not start with a number"));
     }
@@ -372,7 +396,7 @@ mod tests {
 
     #[test]
     fn written_text_reads_back_to_the_same_bits() {
-        for mm in [0.000633, 1.0 / 300.0, 109.0, -1e-17, 1e20] {
+        for mm in [0.000633, 1.0 / 300.0, 109.0, -1e-17, 1e12] {
             let q = Length::new(mm);
             assert_eq!(q.to_string().parse::<Length>(), Ok(q));
         }

@@ -42,6 +42,14 @@ settle = "33 ms"
 frame = { name = "last", role = "deformed" }
 "#;
 const FRAMES: usize = 7;
+/// Ten seconds of one instruction at the slow rate.
+const SLOW: &str = "0.5 mm/s";
+const LONG: &str = r#"
+[[sequence]]
+frame = { name = "first", role = "reference" }
+[[sequence]]
+move = { x = "5 mm" }
+"#;
 
 /// Frames as the trigger line says, by a clock of its own that is 150 ppm fast.
 struct WatchCamera {
@@ -175,8 +183,13 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
+        Self::playing("5 mm/s", SEQUENCE)
+    }
+
+    fn playing(rate: &str, sequence: &str) -> Self {
         let head = template().split("# --- what is played").next().expect("head");
-        let text = format!("{head}{SEQUENCE}");
+        let head = head.replace("\"5 mm/s\"", &format!("{rate:?}"));
+        let text = format!("{head}{sequence}");
         let experiment = Experiment::parse(&text, Path::new("e.toml")).unwrap_or_else(|e| panic!("{e}"));
         let (rig, end) = TestBox::piped();
         let options =
@@ -296,7 +309,18 @@ fn a_run_can_be_cancelled_and_is_stopped_when_it_takes_too_long() {
     let mut bench = Bench::new();
     let error = bench.disturbed(|_, cancel| cancel.store(true, SeqCst));
     assert!(matches!(error, RigError::Cancelled), "{error:?}");
+    // At once, without waiting: the next run must find the box ready.
+    assert_eq!(bench.link.status().expect("status").state, State::Loaded);
     assert_stopped(&mut bench);
+    bench.cancel.store(false, SeqCst);
+    let run = bench.run(&mut NullSink, &mut |_| {}).unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!(run.pairing.counts.paired, FRAMES);
+
+    // An instruction that would take too long is aborted.
+    let mut bench = Bench::playing(SLOW, LONG);
+    let error = bench.disturbed(|_, cancel| cancel.store(true, SeqCst));
+    assert!(matches!(error, RigError::Cancelled), "{error:?}");
+    assert_eq!(bench.link.status().expect("status").state, State::Faulted);
 
     let mut bench = Bench::new();
     bench.options.run_timeout = Some(Duration::from_millis(20));
@@ -341,14 +365,40 @@ fn a_camera_that_disappears_ends_the_run() {
 }
 
 #[test]
-fn a_fault_left_over_is_cleared_and_said() {
+fn a_frame_of_another_size_ends_the_run_and_blames_the_input() {
     let mut bench = Bench::new();
+    bench.options.size_px = Some([4, 3]);
+    let mut keep = Keep::default();
+    let error = bench.run(&mut keep, &mut |_| {}).expect_err("size");
+    assert!(matches!(error, RigError::FrameSize { found: [4, 2], expected: [4, 3] }), "{error:?}");
+    assert!(error.is_input() && error.to_string().contains("4 × 2 pixels, not 4 × 3"), "{error}");
+    assert!(keep.frames.is_empty());
+    let mut bench = Bench::new();
+    bench.camera.info.sensor_px = [8, 2];
+    let error = bench.run(&mut NullSink, &mut |_| {}).expect_err("size");
+    assert!(matches!(error, RigError::FrameSize { found: [4, 2], expected: [8, 2] }), "{error:?}");
+}
+
+#[test]
+fn a_run_that_is_just_ending_is_waited_for() {
+    let mut bench = Bench::new();
+    let hash = bench.link.load(&bench.compiled.program).expect("load");
+    bench.link.arm(hash).expect("arm");
+    bench.link.start().expect("start");
+    let run = bench.run(&mut NullSink, &mut |_| {}).unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!((run.run, run.pairing.counts.paired), (2, FRAMES));
+}
+
+#[test]
+fn a_fault_left_over_is_cleared_and_said() {
+    let mut bench = Bench::playing(SLOW, LONG);
     let hash = bench.link.load(&bench.compiled.program).expect("load");
     bench.link.arm(hash).expect("arm");
     bench.link.start().expect("start");
     let error = bench.run(&mut NullSink, &mut |_| {}).expect_err("still running");
     assert!(matches!(error, RigError::NotReady { state: State::Running }), "{error:?}");
     bench.link.abort().expect("abort");
+    bench.compiled = Bench::new().compiled;
     let mut cleared = 0;
     let run =
         bench.run(&mut NullSink, &mut |p| cleared += usize::from(matches!(p, Progress::FaultCleared(_))));

@@ -89,7 +89,7 @@ fn unknown_keys_are_refused_with_file_line_and_column() {
         ("[processing]\n", "[procesing]\n", "procesing"),
         ("move = { z = \"1.5 mm\" }", "moev = { z = \"1.5 mm\" }", "moev"),
         ("move = { z = \"1.5 mm\" }", "move = { w = \"1.5 mm\" }", "w"),
-        ("subset = 33  ", "subsets = 33  ", "subsets"),
+        ("subset = 59  ", "subsets = 33  ", "subsets"),
         ("lines = \"300 /mm\"", "line = \"300 /mm\"", "line"),
     ] {
         let (text, found) = problems(from, to);
@@ -157,7 +157,7 @@ fn values_that_break_a_rule_are_named_with_what_is_allowed() {
             "\"2000 /mm\"",
             "above the wavelength",
         ),
-        ("subset = 33  ", "subset = 32  ", "processing.subset", "32", "odd"),
+        ("subset = 59  ", "subset = 32  ", "processing.subset", "32", "odd"),
         ("step = 10  ", "step = 0  ", "processing.step", "0", "1 to 1000"),
         (
             "move = { z = \"1.5 mm\" }",
@@ -204,7 +204,7 @@ fn values_that_break_a_rule_are_named_with_what_is_allowed() {
         assert!(p.message.starts_with(field), "{}", p.message);
     }
     // More than one at a time, and no grating at all.
-    let text = template().replace("subset = 33  ", "subset = 32  ").replace("step = 10  ", "step = 0  ");
+    let text = template().replace("subset = 59  ", "subset = 32  ").replace("step = 10  ", "step = 0  ");
     assert_eq!(parse(&text).expect_err("two").problems().len(), 2);
     let text = template().replace("[optics.grating]", "[optics.grating_minus]");
     let shown = parse(&text).expect_err("one grating of two").to_string();

@@ -277,6 +277,10 @@ fn ports_that_are_absent_or_no_ports_are_refused_with_the_way_out() {
     assert!(matches!(error, LinkError::PortAbsent { .. }), "{error:?}");
     let text = error.to_string();
     assert!(text.contains("/dev/daic-no-such-port") && text.contains("tcp://host:port"), "{text}");
+    assert!(text.contains("`daic simulate`") && !text.contains("or sim"), "{text}");
+    let error = Link::open("sim", options()).expect_err("no port");
+    assert!(matches!(error, LinkError::SimulatedRig) && error.is_input(), "{error:?}");
+    assert!(error.to_string().contains("`daic simulate`"), "{error}");
     let file = tempfile::NamedTempFile::new().expect("file");
     let error = Link::open(&file.path().to_string_lossy(), options()).expect_err("a file");
     assert!(matches!(error, LinkError::PortRefused { .. }), "{error:?}");

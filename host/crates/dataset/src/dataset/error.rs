@@ -3,6 +3,7 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
+use serde::{Serialize, Serializer};
 use thiserror::Error;
 
 use crate::atomic::WriteError;
@@ -29,6 +30,32 @@ pub enum DatasetError {
     AlreadyThere {
         /// The folder.
         root: PathBuf,
+    },
+    /// The folder holds a dataset of another kind than the one that may be replaced.
+    #[error(
+        "folder {} holds {}, which is not replaced by a {wanted}; choose another folder",
+        root.display(),
+        kind_of(kind.as_deref())
+    )]
+    OtherKind {
+        /// The folder.
+        root: PathBuf,
+        /// Kind of the dataset in it; `None` for a plain recording.
+        kind: Option<String>,
+        /// Kind that may be replaced.
+        wanted: &'static str,
+    },
+    /// The folder has a `dataset.json` that cannot be read, so it may be anybody's.
+    #[error(
+        "folder {} is not replaced, for it is not sure to be a dataset of daic ({reason}); \
+         choose another folder, or remove this one yourself",
+        root.display()
+    )]
+    NotReplaced {
+        /// The folder.
+        root: PathBuf,
+        /// What is wrong with the manifest.
+        reason: String,
     },
     /// Written by a newer program.
     #[error(
@@ -100,6 +127,22 @@ pub enum DatasetError {
         /// The id.
         id: u64,
     },
+    /// The file of a recorded frame is missing.
+    #[error("frame {id}: its file {} is missing; check that the dataset is complete", file.display())]
+    FrameGone {
+        /// The id.
+        id: u64,
+        /// The file.
+        file: PathBuf,
+    },
+    /// The experiment file of the dataset cannot be read.
+    #[error("cannot read {}: {source}; check that the dataset is complete", path.display())]
+    Experiment {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
     /// A value cannot be written as JSON.
     #[error("cannot write {} as JSON: {reason}", path.display())]
     Serialise {
@@ -127,6 +170,13 @@ pub enum DatasetError {
     Write(#[from] WriteError),
 }
 
+fn kind_of(kind: Option<&str>) -> String {
+    match kind {
+        None => "a recorded dataset".into(),
+        Some(kind) => format!("a dataset of kind {kind:?}"),
+    }
+}
+
 impl DatasetError {
     pub(super) fn io(path: &Path, source: io::Error) -> Self {
         DatasetError::Io { path: path.to_path_buf(), source }
@@ -147,6 +197,7 @@ impl DatasetError {
 }
 
 /// Damage that does not hinder reading the rest; a program using the dataset must say it.
+/// Serialised as the sentence that [`std::fmt::Display`] gives.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum Damage {
     /// The last line of a journal is incomplete: the recording was interrupted while writing it.
@@ -160,13 +211,16 @@ pub enum Damage {
         bytes: u64,
     },
     /// A journal is missing.
-    #[error("{} is missing", path.display())]
+    #[error("{} is missing; check that the dataset is complete", path.display())]
     JournalGone {
         /// The journal.
         path: PathBuf,
     },
     /// A recorded image is missing.
-    #[error("frame {id}: its file {} is missing", file.display())]
+    #[error(
+        "frame {id}: its file {} is missing; the frame is left out; restore the file to measure it",
+        file.display()
+    )]
     FrameFileGone {
         /// The frame.
         id: u64,
@@ -181,4 +235,10 @@ pub enum Damage {
         /// Number that does.
         found: u32,
     },
+}
+
+impl Serialize for Damage {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
 }

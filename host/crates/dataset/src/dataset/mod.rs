@@ -31,7 +31,7 @@ pub use records::{EventRecord, FrameRecord, FrameRole, Manifest, StrobeRecord, V
 pub use results::result_key;
 
 use crate::atomic;
-use crate::image_file::{self, GreyImage};
+use crate::image_file::{self, GreyImage, ImageFileError};
 use crate::table::{Column, Table};
 use journal::Journal;
 
@@ -56,6 +56,9 @@ pub enum Existing {
     Refuse,
     /// Remove the parts of the old dataset; other files in the folder stay.
     Replace,
+    /// As `Replace`, but only a dataset of this [`Manifest::kind`]; any other is refused. The new
+    /// dataset is of this kind, too.
+    ReplaceKind(&'static str),
 }
 
 /// A dataset folder, open for reading results into it; for recording see [`Recording`].
@@ -86,11 +89,15 @@ pub struct Contents<T> {
 impl Dataset {
     /// Makes the folder and writes manifest and experiment file; the recording can begin.
     ///
-    /// `manifest.format` and `manifest.format_version` are set here.
+    /// `manifest.format` and `manifest.format_version` are set here, and `manifest.kind` for
+    /// [`Existing::ReplaceKind`].
     ///
     /// # Errors
     /// [`DatasetError::NotEmpty`] for a folder with other files in it,
-    /// [`DatasetError::AlreadyThere`] for a dataset unless it is to be replaced, write errors.
+    /// [`DatasetError::AlreadyThere`] for a dataset unless it is to be replaced,
+    /// [`DatasetError::OtherKind`] for one that is not of the kind to be replaced,
+    /// [`DatasetError::NotReplaced`] and [`DatasetError::NewerFormat`] for one whose manifest
+    /// cannot be read, write errors. What was in the folder is then untouched, but for write errors.
     pub fn create(
         root: &Path,
         mut manifest: Manifest,
@@ -100,6 +107,9 @@ impl Dataset {
         clear_for_new(root, existing)?;
         manifest.format = FORMAT.into();
         manifest.format_version = FORMAT_VERSION;
+        if let Existing::ReplaceKind(kind) = existing {
+            manifest.kind = Some(kind.into());
+        }
         let dataset = Dataset { root: root.to_path_buf(), manifest };
         atomic::write_bytes_synced(&root.join(MANIFEST), &to_json(&dataset.manifest, &root.join(MANIFEST))?)?;
         atomic::write_bytes_synced(&root.join(EXPERIMENT), experiment_toml.as_bytes())?;
@@ -164,10 +174,10 @@ impl Dataset {
     /// The experiment file, as it was given.
     ///
     /// # Errors
-    /// [`DatasetError::Io`] if it is missing or not text.
+    /// [`DatasetError::Experiment`] if it is missing or not text.
     pub fn experiment_toml(&self) -> Result<String, DatasetError> {
         let path = self.root.join(EXPERIMENT);
-        fs::read_to_string(&path).map_err(|source| DatasetError::io(&path, source))
+        fs::read_to_string(&path).map_err(|source| DatasetError::Experiment { path, source })
     }
 
     /// The frames, in the order they came in. Of several lines of one id the last is taken.
@@ -206,11 +216,15 @@ impl Dataset {
     /// The image of a frame.
     ///
     /// # Errors
-    /// [`DatasetError::NoImage`] for a frame that never came, else [`DatasetError::Image`].
+    /// [`DatasetError::NoImage`] for a frame that never came, [`DatasetError::FrameGone`] for one
+    /// whose file is missing, else [`DatasetError::Image`].
     pub fn read_frame(&self, record: &FrameRecord) -> Result<GreyImage, DatasetError> {
         let file = record.file.as_ref().ok_or(DatasetError::NoImage { id: record.id })?;
         check_inside(&self.root.join(FRAMES), 0, file)?;
-        Ok(image_file::read_grey(&self.root.join(file))?)
+        image_file::read_grey(&self.root.join(file)).map_err(|error| match error {
+            ImageFileError::Missing { path } => DatasetError::FrameGone { id: record.id, file: path },
+            other => DatasetError::Image(other),
+        })
     }
 
     /// The events, in the order they were written. A jump of the sequence number is reported as
@@ -396,11 +410,16 @@ fn clear_for_new(root: &Path, existing: Existing) -> Result<(), DatasetError> {
     if existing == Existing::Refuse {
         return Err(DatasetError::AlreadyThere { root: root.to_path_buf() });
     }
-    // Only a folder that is one of ours is cleared; a foreign dataset.json is not enough.
-    match Dataset::open(root) {
-        Err(e @ DatasetError::NotADataset { .. }) => return Err(e),
-        Err(e @ DatasetError::NewerFormat { .. }) => return Err(e),
-        _ => {}
+    // Only a folder that is surely one of ours is cleared; a file called dataset.json is not enough.
+    let old = Dataset::open(root).map_err(|error| match error {
+        DatasetError::NotADataset { root } => DatasetError::NotEmpty { root },
+        newer @ DatasetError::NewerFormat { .. } => newer,
+        other => DatasetError::NotReplaced { root: root.to_path_buf(), reason: other.to_string() },
+    })?;
+    if let Existing::ReplaceKind(wanted) = existing
+        && old.manifest.kind.as_deref() != Some(wanted)
+    {
+        return Err(DatasetError::OtherKind { root: root.to_path_buf(), kind: old.manifest.kind, wanted });
     }
     for dir in [RESULTS, FRAMES_DIR] {
         remove(fs::remove_dir_all(root.join(dir)), &root.join(dir))?;

@@ -18,6 +18,10 @@ pub struct Manifest {
     pub program: String,
     /// Its version.
     pub program_version: String,
+    /// What made the dataset, where that is more than a recording ("demo"); decides whether it may
+    /// be replaced, see [`super::Existing::ReplaceKind`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub kind: Option<String>,
     /// Seed of everything random, for a simulated rig.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub seed: Option<u64>,
@@ -44,6 +48,7 @@ impl Manifest {
             format_version: 0,
             program: program.into(),
             program_version: program_version.into(),
+            kind: None,
             seed: None,
             tick_hz: None,
             started_utc: None,

@@ -1,6 +1,8 @@
 //! Results of one frame, and whether they still belong to the present settings and inputs.
 
+use std::collections::BTreeMap;
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use crc::{CRC_64_XZ, Crc};
@@ -15,6 +17,8 @@ const DONE: &str = "done.json";
 #[derive(Serialize, Deserialize)]
 struct Done {
     key: String,
+    /// Length in bytes of every result file, by name.
+    files: BTreeMap<String, u64>,
 }
 
 /// A key over everything a result depends on: program version, settings (as JSON) and the content
@@ -49,14 +53,15 @@ impl Dataset {
         self.root.join(RESULTS).join(format!("{id:06}"))
     }
 
-    /// Whether the results of a frame are complete and belong to this key. Anything unreadable
-    /// counts as not done.
+    /// Whether the results of a frame belong to this key and are complete: every file that was
+    /// there when they were marked done is there, with its length. Anything unreadable counts as
+    /// not done.
     #[must_use]
     pub fn is_done(&self, id: u64, key: &str) -> bool {
-        fs::read(self.frame_results(id).join(DONE))
-            .ok()
-            .and_then(|bytes| serde_json::from_slice::<Done>(&bytes).ok())
-            .is_some_and(|done| done.key == key)
+        let dir = self.frame_results(id);
+        let done = fs::read(dir.join(DONE)).ok().and_then(|b| serde_json::from_slice::<Done>(&b).ok());
+        let (Some(done), Ok(present)) = (done, file_lengths(&dir)) else { return false };
+        done.key == key && done.files.iter().all(|(name, length)| present.get(name) == Some(length))
     }
 
     /// Empties the folder of a frame's results and makes it anew; call before computing.
@@ -71,12 +76,30 @@ impl Dataset {
         Ok(dir)
     }
 
-    /// States that the results of a frame are complete; call last.
+    /// States that the results of a frame are complete, the files as they now are in its folder;
+    /// call last.
     ///
     /// # Errors
-    /// [`DatasetError::Write`], naming the file.
+    /// [`DatasetError::Io`] or [`DatasetError::Write`], naming folder or file.
     pub fn mark_done(&self, id: u64, key: &str) -> Result<(), DatasetError> {
-        let path = self.frame_results(id).join(DONE);
-        Ok(atomic::write_bytes_synced(&path, &to_json(&Done { key: key.into() }, &path)?)?)
+        let dir = self.frame_results(id);
+        let files = file_lengths(&dir).map_err(|source| DatasetError::io(&dir, source))?;
+        let path = dir.join(DONE);
+        Ok(atomic::write_bytes_synced(&path, &to_json(&Done { key: key.into(), files }, &path)?)?)
     }
+}
+
+/// Length of every file of a folder of results, by name, but for the mark itself. Folders in it
+/// are not looked into: results are flat.
+fn file_lengths(dir: &Path) -> io::Result<BTreeMap<String, u64>> {
+    let mut lengths = BTreeMap::new();
+    for entry in fs::read_dir(dir)? {
+        let entry = entry?;
+        let data = fs::metadata(entry.path())?;
+        let name = entry.file_name();
+        if data.is_file() && name != DONE {
+            lengths.insert(name.to_string_lossy().into_owned(), data.len());
+        }
+    }
+    Ok(lengths)
 }

@@ -61,7 +61,7 @@ pub enum ImageFileError {
         path: PathBuf,
     },
     /// The system refused to read it (permissions, a folder, a broken device).
-    #[error("cannot read image file {}: {source}", path.display())]
+    #[error("cannot read image file {}: {source}; check that it is a file and may be read", path.display())]
     Unreadable {
         /// The file.
         path: PathBuf,

@@ -8,9 +8,9 @@ use crate::camera::{Camera, CameraSettings, CameraStats, Frame, FrameError};
 use crate::clock::{ClockModel, ClockOptions, sample_period_ms};
 use crate::compile::Compiled;
 use crate::error::RigError;
-use crate::link::{EventReader, Link};
+use crate::link::{EventReader, Link, LinkError};
 use crate::pairing::{PairingOptions, Stamp};
-use daic_protocol::message::{Event, EventKind, Fault, State};
+use daic_protocol::message::{Event, EventKind, Fault, State, Status};
 use std::collections::HashSet;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
@@ -100,6 +100,8 @@ pub struct AcquireOptions {
     pub latency: Option<Latency>,
     /// Clocks of camera and box.
     pub pairing: PairingOptions,
+    /// Columns and rows that every frame must have, beside what the camera says of its sensor.
+    pub size_px: Option<[u32; 2]>,
 }
 
 impl AcquireOptions {
@@ -113,12 +115,18 @@ impl AcquireOptions {
             clock: None,
             latency: None,
             pairing: PairingOptions::new(tick_hz),
+            size_px: None,
         }
     }
 }
 
 /// Frames that wait for the sink; when it is full the camera's own buffer fills.
 const QUEUE: usize = 16;
+
+/// How long a run that was stopped may take to end its current instruction.
+const STOP_PATIENCE: Duration = Duration::from_secs(2);
+/// Between two looks at a box that is to end its run.
+const STOP_POLL: Duration = Duration::from_millis(5);
 
 /// Makes one run. `cancel` set to true stops it after the current instruction.
 ///
@@ -136,7 +144,7 @@ pub fn acquire(
     progress: &mut dyn FnMut(Progress),
     cancel: &AtomicBool,
 ) -> Result<Run, RigError> {
-    let status = link.status()?;
+    let status = settled(link, cancel)?;
     match status.state {
         State::Faulted => {
             link.clear_fault()?;
@@ -147,6 +155,7 @@ pub fn acquire(
         State::Running => return Err(RigError::NotReady { state: status.state }),
         State::Empty | State::Loaded | State::Armed => {}
     }
+    let sizes = [options.size_px, Some(camera.info().sensor_px).filter(|s| *s != [0, 0])];
     let hash = link.load(&compiled.program)?;
     link.arm(hash)?;
     let first_event = link.status()?.next_event;
@@ -163,6 +172,7 @@ pub fn acquire(
         progress,
         cancel,
         hash,
+        sizes,
         events: Vec::new(),
         reader: EventReader::new(first_event),
         clock: options.clock.map(ClockModel::new),
@@ -208,6 +218,8 @@ struct Collector<'a> {
     progress: &'a mut dyn FnMut(Progress),
     cancel: &'a AtomicBool,
     hash: u32,
+    /// What every frame must measure, where it is known.
+    sizes: [Option<[u32; 2]>; 2],
     events: Vec<Event>,
     reader: EventReader,
     clock: Option<ClockModel>,
@@ -292,6 +304,10 @@ impl Collector<'_> {
         for _ in 0..QUEUE {
             match frames.recv_timeout(wait) {
                 Ok(Ok(frame)) => {
+                    let found = [frame.width, frame.height];
+                    if let Some(expected) = self.sizes.into_iter().flatten().find(|size| *size != found) {
+                        return Err(RigError::FrameSize { found, expected });
+                    }
                     let host = frame.host.saturating_duration_since(self.link.epoch()).as_nanos();
                     let host_ns = Some(i64::try_from(host).unwrap_or(i64::MAX));
                     self.stamps.push(Stamp { id: frame.id, camera_ns: frame.camera_ns, host_ns });
@@ -323,12 +339,29 @@ impl Collector<'_> {
         Ok(())
     }
 
-    /// Outputs safe, whatever went wrong.
+    /// Outputs safe, whatever went wrong, and the box ready for another run.
     fn halt(&mut self) {
-        let stopped = self.link.stop().or_else(|_| self.link.abort());
+        let stopped = match self.link.stop() {
+            Ok(_) => self.wait_stopped(),
+            Err(_) => self.link.abort().map(drop),
+        };
         if let Err(error) = stopped {
             tracing::debug!(%error, "the box could not be stopped");
         }
+    }
+
+    /// `Stop` ends with the current instruction; one that takes too long is aborted.
+    fn wait_stopped(&mut self) -> Result<(), LinkError> {
+        let deadline = Instant::now() + STOP_PATIENCE;
+        while self.link.status()?.state == State::Running {
+            if Instant::now() >= deadline {
+                return self.link.abort().map(drop);
+            }
+            // A simulated box plays on only as its events are read.
+            self.reader.poll(self.link, &mut self.events)?;
+            std::thread::sleep(STOP_POLL);
+        }
+        Ok(())
     }
 
     fn finish(self) -> Result<Run, RigError> {
@@ -346,6 +379,21 @@ impl Collector<'_> {
             link: self.link.stats(),
             camera: CameraStats::default(),
         })
+    }
+}
+
+/// Status of the box; one that is just ending a run is waited for.
+fn settled(link: &mut Link, cancel: &AtomicBool) -> Result<Status, RigError> {
+    let deadline = Instant::now() + STOP_PATIENCE;
+    loop {
+        let status = link.status()?;
+        if status.state != State::Running || Instant::now() >= deadline {
+            return Ok(status);
+        }
+        if cancel.load(Ordering::Relaxed) {
+            return Err(RigError::Cancelled);
+        }
+        std::thread::sleep(STOP_POLL);
     }
 }
 

@@ -246,7 +246,6 @@ fn processing(p: &Processing, f: &mut Findings) {
         "an odd number, 5 to 255 pixels",
     );
     f.require((1..=1000).contains(&p.step), "processing.step", p.step, "1 to 1000 pixels");
-    f.require(p.threads <= 4096, "processing.threads", p.threads, "0 (all) to 4096");
     if let Some(noise) = p.noise {
         f.require((0.0..=65_535.0).contains(&noise), "processing.noise", noise, "0 to 65535 grey levels");
     }

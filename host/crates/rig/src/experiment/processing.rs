@@ -24,8 +24,6 @@ pub struct Processing {
     /// Height of the specimen where the optical axis meets it, stage at the reference frame: the datum
     /// from which a calibration counts heights (moves alone do not say where h = 0 is).
     pub axis_height: Length,
-    /// Threads; 0 takes as many as the machine has.
-    pub threads: usize,
     /// Standard deviation of the camera noise in grey levels; left out, estimated from the frames.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub noise: Option<f64>,
@@ -51,7 +49,6 @@ impl Default for Processing {
             decoder: Decoder::Ray,
             calibrate: true,
             axis_height: Length::new(0.0),
-            threads: 0,
             noise: None,
             max_iterations: 30,
             convergence: 1e-3,

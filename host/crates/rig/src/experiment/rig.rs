@@ -34,7 +34,7 @@ pub struct Rig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CameraSection {
-    /// Where frames come from.
+    /// Where `daic run` takes frames from when `--frames` is not given.
     #[serde(default)]
     pub source: CameraSource,
     /// Trigger line of the box, 0…3.

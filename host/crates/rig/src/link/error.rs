@@ -27,6 +27,11 @@ pub enum LinkError {
         /// Ports that the system lists.
         available: Vec<String>,
     },
+    /// `sim` is not a port.
+    #[error(
+        "sim is not a port: use `daic simulate` for the simulated rig, or give a serial port or tcp://host:port"
+    )]
+    SimulatedRig,
     /// Another program has the port.
     #[error("port {path} is in use by another program; close that program, or choose another port")]
     PortBusy {
@@ -188,6 +193,7 @@ impl LinkError {
             | Self::Disconnected { sent: true, .. } => Outcome::Unknown,
             Self::Disconnected { sent: false, .. }
             | Self::PortAbsent { .. }
+            | Self::SimulatedRig
             | Self::PortBusy { .. }
             | Self::PortRefused { .. }
             | Self::BadAddress { .. }
@@ -205,6 +211,7 @@ impl LinkError {
         matches!(
             self,
             Self::BadAddress { .. }
+                | Self::SimulatedRig
                 | Self::ProgramTooLong { .. }
                 | Self::Refused { refusal: Refusal::Invalid(_) | Refusal::ProgramTooLong { .. }, .. }
         )
@@ -216,9 +223,13 @@ struct Available<'a>(&'a [String]);
 impl fmt::Display for Available<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.0.is_empty() {
-            f.write_str("the system lists no serial port: plug the box in, or give tcp://host:port or sim")
+            f.write_str("the system lists no serial port: plug the box in, give tcp://host:port, or use `daic simulate` for the simulated rig")
         } else {
-            write!(f, "the system lists {}; choose one of them, tcp://host:port or sim", self.0.join(", "))
+            write!(
+                f,
+                "the system lists {}; choose one of them or tcp://host:port, or use `daic simulate` for the simulated rig",
+                self.0.join(", ")
+            )
         }
     }
 }

@@ -30,9 +30,12 @@ pub trait Transport: Send {
 /// Opens what `port` names: `tcp://host:port` or the path of a serial port.
 ///
 /// # Errors
-/// [`LinkError::PortAbsent`], [`LinkError::PortBusy`], [`LinkError::PortRefused`],
+/// [`LinkError::SimulatedRig`], [`LinkError::PortAbsent`], [`LinkError::PortBusy`], [`LinkError::PortRefused`],
 /// [`LinkError::BadAddress`], [`LinkError::Unreachable`].
 pub fn open(port: &str, baud: u32) -> Result<Box<dyn Transport>, LinkError> {
+    if port.trim() == "sim" {
+        return Err(LinkError::SimulatedRig);
+    }
     match port.strip_prefix("tcp://") {
         Some(address) => tcp(port, address),
         None => serial(port, baud),
