@@ -7,7 +7,7 @@ use std::path::Path;
 use tempfile::TempDir;
 
 /// Numbers of the points that are `ok`. Both views see |x| < 9.2 mm; subsets of 59 pixels stay inside the sensor,
-/// which leaves x = −8.35 … +8.46 mm.
+/// which leaves x = −8.44 … +8.48 mm.
 fn columns<const N: usize>(path: &Path, names: [&str; N]) -> Vec<[f64; N]> {
     let table = Table::read_csv(path).expect("points.csv");
     let all = names.map(|name| table.numbers(name, path).expect("numbers"));

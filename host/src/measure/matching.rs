@@ -240,13 +240,16 @@ impl Reference {
 }
 
 /// Edges of a view are found to about this many pixels; subsets stay as far inside.
-const VIEW_EDGE_PX: usize = 8;
+const VIEW_EDGE_PX: usize = 12;
 
-/// Where the centres of subsets can lie that are wholly inside `view`; `None` where there is no room.
-fn centres(view: &Rectangle, subset_radius: usize) -> Option<Rectangle> {
-    let radius = subset_radius + VIEW_EDGE_PX;
-    let (width, height) = (view.width.checked_sub(2 * radius)?, view.height.checked_sub(2 * radius)?);
-    (width > 0 && height > 0).then_some(Rectangle { x: view.x + radius, y: view.y + radius, width, height })
+/// Where the centres of subsets can lie that are wholly inside `view`; `None` where there is no room. Where the
+/// sensor cuts the view there is no edge to stay away from.
+fn centres(view: &Rectangle, radius: usize) -> Option<Rectangle> {
+    let inset = |start: usize| radius + if start == 0 { 0 } else { VIEW_EDGE_PX };
+    let (left, top) = (inset(view.x), inset(view.y));
+    let width = view.width.checked_sub(left + radius + VIEW_EDGE_PX)?;
+    let height = view.height.checked_sub(top + radius + VIEW_EDGE_PX)?;
+    (width > 0 && height > 0).then_some(Rectangle { x: view.x + left, y: view.y + top, width, height })
 }
 
 fn match_of(point: &Point) -> Match {
