@@ -55,8 +55,9 @@ const THIRTY_THREE: [&str; 8] =
 
 #[test]
 fn golden_translations_reach_the_bound() {
-    // case, largest bias, largest scatter: the specification's; the Cramér–Rao bounds are 6.5e-4 and 4.55e-3
-    for (noise, bias_limit, std_limit) in [("n0", 1.5e-4, 6.9e-4), ("n2", 1e-3, 4.8e-3)] {
+    // case, largest bias, largest scatter: the specification's (the Cramér–Rao bounds are 6.5e-4 and 4.55e-3), but for
+    // the bias of n2: measured u 1.1e-4, v 2.2e-4, with noise of 2 grey levels a matter of the two noise images
+    for (noise, bias_limit, std_limit) in [("n0", 1.5e-4, 6.9e-4), ("n2", 3e-4, 4.8e-3)] {
         let name = "golden_translations_reach_the_bound";
         let Some(reference) = shared(name, &format!("golden/dic/s1024_{noise}_ref.png")) else { return };
         let Some(deformed) = shared(name, &format!("golden/dic/s1024_{noise}_t02.png")) else { return };
