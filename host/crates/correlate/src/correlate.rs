@@ -2,7 +2,7 @@
 
 use crate::consistency;
 use crate::icgn::{Outcome, Solver};
-use crate::point::{Point, ShapeParameters, Status};
+use crate::point::{Point, ShapeParameters, SolvedBy, Status};
 use crate::points::Points;
 use crate::prepared::{Reference, Target};
 use crate::propagate::Propagation;
@@ -284,12 +284,14 @@ fn point(points: &Points, k: usize, outcome: Option<&Outcome>) -> Point {
         zncc: f32::NAN,
         iterations: 0,
         status: Status::NoGuess,
+        solver: SolvedBy::Exact,
         shape: ShapeParameters::default(),
     };
     let Some(o) = outcome else {
         return p;
     };
     p.status = o.status;
+    p.solver = o.solver;
     p.iterations = o.iterations;
     if o.iterations == 0 {
         return p;

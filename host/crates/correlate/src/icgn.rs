@@ -5,7 +5,7 @@ use crate::kernel::{Sampling, Sums, sweep};
 use crate::noise::NoiseGain;
 use crate::normal::{MAX, Normal};
 use crate::plane::PAD;
-use crate::point::Status;
+use crate::point::{SolvedBy, Status};
 use crate::prepared::{Reference, Target};
 use crate::scalar;
 use crate::settings::{Interpolation, Settings};
@@ -51,13 +51,22 @@ pub(crate) struct Outcome {
     pub(crate) iterations: u16,
     /// Converged, or why not; neighbours have not been asked.
     pub(crate) status: Status,
+    pub(crate) solver: SolvedBy,
     /// Standard uncertainties of u and v at the asked offset from the centre.
     pub(crate) sigma: [f32; 2],
 }
 
 impl Outcome {
     pub(crate) fn failed(status: Status, warp: Warp) -> Self {
-        Self { warp, zncc: f64::NAN, independent: f64::NAN, iterations: 0, status, sigma: [f32::NAN; 2] }
+        Self {
+            warp,
+            zncc: f64::NAN,
+            independent: f64::NAN,
+            iterations: 0,
+            status,
+            solver: SolvedBy::Exact,
+            sigma: [f32::NAN; 2],
+        }
     }
 }
 

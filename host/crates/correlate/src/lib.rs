@@ -33,9 +33,9 @@ pub use correlate::{
     CorrelateError, Correlation, Guess, Observer, Stage, Timing, correlate, correlate_scalar, simd_level,
 };
 pub use image::{Image, ImageError, Mask};
-pub use point::{Point, ShapeParameters, Status};
+pub use point::{Point, ShapeParameters, SolvedBy, Status};
 pub use points::{Grid, Points, PointsError, Rectangle, Roi};
 pub use prepared::{Reference, Target};
-pub use settings::{Interpolation, Settings, SettingsError};
+pub use settings::{Criterion, Interpolation, Settings, SettingsError, SolverChoice};
 pub use shape::Shape;
 pub use views::{View, Views, ViewsError, find_views};

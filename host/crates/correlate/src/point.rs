@@ -3,6 +3,36 @@
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
+/// Which form of the optimisation gave a point's numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SolvedBy {
+    /// The point's own Gauss–Newton iteration.
+    #[default]
+    Exact,
+    /// The dense form: all overlapping subsets at once.
+    Dense,
+    /// Own iteration on the part of the subset on the point's side of a discontinuity.
+    Split,
+}
+
+impl SolvedBy {
+    /// Stable name.
+    pub fn name(self) -> &'static str {
+        match self {
+            SolvedBy::Exact => "exact",
+            SolvedBy::Dense => "dense",
+            SolvedBy::Split => "split",
+        }
+    }
+}
+
+impl fmt::Display for SolvedBy {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
 /// Verdict on a point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -103,6 +133,8 @@ pub struct Point {
     /// Verdict. Where it is not `Converged`, u, v and the rest are what the last attempt left, for
     /// diagnosis only.
     pub status: Status,
+    /// Which form of the optimisation gave the numbers.
+    pub solver: SolvedBy,
     /// Parameters of the shape function at the subset's centre pixel (the pixel nearest (x, y)).
     pub shape: ShapeParameters,
 }

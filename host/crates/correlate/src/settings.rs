@@ -16,6 +16,30 @@ pub enum Interpolation {
     Quintic,
 }
 
+/// Which form of the optimisation solves the points.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SolverChoice {
+    /// The dense form where it is valid, the exact form everywhere else.
+    #[default]
+    Auto,
+    /// The dense form alone: points where it is not valid are reported as such.
+    Dense,
+    /// Every point by its own Gauss–Newton iteration.
+    Exact,
+}
+
+/// What is minimised over a subset.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Criterion {
+    /// Zero-normalised sum of squared differences: blind to brightness and contrast.
+    #[default]
+    Znssd,
+    /// Zero-mean sum of squared differences: blind to brightness alone.
+    Zssd,
+}
+
 /// Settings of a subset correlation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -26,6 +50,10 @@ pub struct Settings {
     pub shape: Shape,
     /// Interpolation of the deformed image.
     pub interpolation: Interpolation,
+    /// What is minimised.
+    pub criterion: Criterion,
+    /// Which form of the optimisation is used.
+    pub solver: SolverChoice,
     /// The iteration stops when the increment moves no pixel on the subset's edge by more than
     /// about this many pixels.
     pub tolerance: f64,
@@ -53,6 +81,8 @@ impl Default for Settings {
             subset: 33,
             shape: Shape::Affine,
             interpolation: Interpolation::Quintic,
+            criterion: Criterion::Znssd,
+            solver: SolverChoice::Auto,
             tolerance: 1e-3,
             max_iterations: 30,
             min_zncc: 0.5,
