@@ -1,4 +1,4 @@
-//! Points per second of a correlation: `speed REF DEF [subset] [step] [order] [csv] [repeats]`, one
+//! Points per second of a correlation: `speed REF DEF [subset] [step] [order] [csv] [repeats] [exact|dense|auto]`, one
 //! thread. Everything from the 8-bit pixels on is counted.
 
 use daic_correlate::*;
@@ -32,7 +32,14 @@ fn main() {
         1 => Shape::Affine,
         _ => Shape::Quadratic,
     };
-    let settings = Settings { subset: number(3, 33), shape, ..Settings::default() };
+    let solver = match args.get(8).map(String::as_str) {
+        Some("exact") => SolverChoice::Exact,
+        Some("dense") => SolverChoice::Dense,
+        _ => SolverChoice::Auto,
+    };
+    let settings = Settings { subset: number(3, 33), shape, solver, ..Settings::default() };
+    let mut workspace = Workspace::new();
+    let mut kept: Option<(Reference, Target)> = None;
     let roi = Roi {
         rectangle: Some(Rectangle { x: 40, y: 40, width: a.width() - 80, height: a.height() - 80 }),
         mask: None,
@@ -43,19 +50,27 @@ fn main() {
         let (a, b) = (a.clone(), b.clone());
         let (start, cpu0) = (Instant::now(), cpu());
         let (c, prepare) = pool.install(|| {
-            let reference = Reference::new(a);
-            let target = Target::new(b, settings.interpolation);
+            match &mut kept {
+                Some((reference, target)) => {
+                    reference.update(a);
+                    target.update(b);
+                }
+                none => *none = Some((Reference::new(a), Target::new(b, settings.interpolation))),
+            }
+            let Some((reference, target)) = &kept else { unreachable!("made above") };
             let prepare = start.elapsed();
-            let c =
-                correlate(&reference, &target, &points, &Guess::Fft, &settings, &()).expect("a correlation");
+            let c = workspace
+                .correlate(reference, target, &points, &Guess::Fft, &settings, &())
+                .expect("a correlation");
             (c, prepare)
         });
         let total = cpu() - cpu0;
         let iterations: u32 = c.points.iter().map(|p| u32::from(p.iterations)).sum();
         println!(
-            "{} points, {} ok, prepare {:.1} ms, init {:.1} ms, solve {:.1} ms, {:.2} iterations: {:.0} points/CPU-s ({})",
+            "{} points, {} ok, {} dense, prepare {:.1} ms, init {:.1} ms, solve {:.1} ms, {:.2} iterations: {:.0} points/CPU-s ({})",
             points.len(),
             c.converged(),
+            c.points.iter().filter(|p| p.solver == SolvedBy::Dense && p.status.is_ok()).count(),
             prepare.as_secs_f64() * 1e3,
             c.timing.init.as_secs_f64() * 1e3,
             c.timing.solve.as_secs_f64() * 1e3,

@@ -1,13 +1,15 @@
 //! The run over all points: checks, initial guesses, propagation, verdicts.
 
 use crate::consistency;
+use crate::dense::Dense;
 use crate::icgn::{Outcome, Solver};
 use crate::point::{Point, ShapeParameters, SolvedBy, Status};
 use crate::points::Points;
 use crate::prepared::{Reference, Target};
 use crate::propagate::Propagation;
-use crate::settings::{Interpolation, Settings, SettingsError};
-use fearless_simd::Level;
+use crate::simd::dispatch;
+use crate::settings::{Interpolation, Settings, SettingsError, SolverChoice};
+use fearless_simd::{Level, Simd};
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
@@ -156,6 +158,82 @@ const LIMIT: f64 = 65536.0;
 /// Most shifts searched at one seed.
 const MAX_SHIFTS: f64 = 16e6;
 
+/// Memory that is used again from one run to the next. A series of images with one reference and one
+/// grid needs it once; results are those of [`correlate`].
+#[derive(Default)]
+pub struct Workspace {
+    dense: Dense,
+}
+
+impl Workspace {
+    /// An empty workspace; memory is taken when it is needed.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// As [`correlate`], with this memory.
+    ///
+    /// # Errors
+    /// As [`correlate`].
+    pub fn correlate(
+        &mut self,
+        reference: &Reference,
+        target: &Target,
+        points: &Points,
+        guess: &Guess<'_>,
+        settings: &Settings,
+        observer: &dyn Observer,
+    ) -> Result<Correlation, CorrelateError> {
+        check(reference, target, points, guess, settings)?;
+        let start = Instant::now();
+        observer.stage(Stage::Init);
+        let solver = Solver::new(reference, target, settings, Level::new());
+        let mut run = Propagation::new(&solver, points, observer);
+        let dense = settings.solver != SolverChoice::Exact && self.dense.prepare(&solver, points);
+        let sparse = if dense { self.dense.sparse(points) } else { None };
+        let Some(sparse) = sparse else {
+            return run_exact(run, guess, start);
+        };
+        let loose = Settings { tolerance: settings.tolerance.max(LOOSE), ..settings.clone() };
+        let solver_sparse = Solver::new(reference, target, &loose, Level::new());
+        let few = points.selected(&sparse.points);
+        let quiet = Quiet(observer);
+        let mut first = Propagation::new(&solver_sparse, &few, &quiet);
+        let guesses = few_guesses(guess, &sparse.points);
+        let guess_sparse = guesses.as_deref().map_or(*guess, Guess::Given);
+        let seeds = first.start(&guess_sparse);
+        first.finish(seeds, &guess_sparse);
+        let init = start.elapsed();
+        observer.stage(Stage::Solve);
+        let proposals = self.dense.solve(&solver, points, &sparse, &first.outcomes, &mut run.outcomes);
+        if settings.solver == SolverChoice::Dense {
+            run.give_up(&proposals);
+        } else {
+            run.complete(&proposals, guess, first);
+        }
+        finished(run, start, init)
+    }
+}
+
+/// Edge motion, in pixels, at which the sparse points of the dense form stop: its passes do the rest.
+const LOOSE: f64 = 0.02;
+
+/// Passes on whether to stop, nothing else.
+struct Quiet<'a>(&'a dyn Observer);
+
+impl Observer for Quiet<'_> {
+    fn cancelled(&self) -> bool {
+        self.0.cancelled()
+    }
+}
+
+fn few_guesses(guess: &Guess<'_>, few: &[usize]) -> Option<Vec<Option<[f64; 2]>>> {
+    match guess {
+        Guess::Given(list) => Some(few.iter().map(|&k| list[k]).collect()),
+        _ => None,
+    }
+}
+
 /// Correlates the deformed image `target` with `reference` at `points`.
 ///
 /// Runs on the current rayon thread pool; the result does not depend on its size.
@@ -170,11 +248,11 @@ pub fn correlate(
     settings: &Settings,
     observer: &dyn Observer,
 ) -> Result<Correlation, CorrelateError> {
-    correlate_at(Level::new(), false, reference, target, points, guess, settings, observer)
+    Workspace::new().correlate(reference, target, points, guess, settings, observer)
 }
 
-/// As [`correlate`], with the scalar double-precision reference implementation of the inner loops:
-/// some hundred times slower, for checking.
+/// As [`correlate`], with the scalar double-precision reference implementation of the inner loops and
+/// every point by its own iteration: some hundred times slower, for checking.
 ///
 /// # Errors
 /// As [`correlate`].
@@ -186,13 +264,41 @@ pub fn correlate_scalar(
     settings: &Settings,
     observer: &dyn Observer,
 ) -> Result<Correlation, CorrelateError> {
-    correlate_at(Level::new(), true, reference, target, points, guess, settings, observer)
+    check(reference, target, points, guess, settings)?;
+    let start = Instant::now();
+    observer.stage(Stage::Init);
+    let mut solver = Solver::new(reference, target, settings, Level::new());
+    solver.scalar = true;
+    run_exact(Propagation::new(&solver, points, observer), guess, start)
+}
+
+fn run_exact(
+    mut run: Propagation<'_>,
+    guess: &Guess<'_>,
+    start: Instant,
+) -> Result<Correlation, CorrelateError> {
+    let seeds = run.start(guess);
+    let init = start.elapsed();
+    run.observer.stage(Stage::Solve);
+    run.finish(seeds, guess);
+    finished(run, start, init)
+}
+
+fn finished(run: Propagation<'_>, start: Instant, init: Duration) -> Result<Correlation, CorrelateError> {
+    let points = run.points;
+    if run.observer.cancelled() {
+        return Err(CorrelateError::Cancelled { done: run.done(), total: points.len() });
+    }
+    let mut outcomes = run.outcomes;
+    consistency::judge(run.solver, points, &mut outcomes);
+    let points = outcomes.iter().enumerate().map(|(k, o)| point(points, k, o.as_ref())).collect();
+    Ok(Correlation { points, timing: Timing { init, solve: start.elapsed() - init } })
 }
 
 /// Name of the SIMD instruction set that the kernels use on this machine.
 pub fn simd_level() -> String {
-    let debug = format!("{:?}", Level::new());
-    debug.split(['(', ' ', '{']).next().unwrap_or_default().to_owned()
+    let name = format!("{:?}", dispatch!(Level::new(), s => s.level()));
+    name.split(['(', ' ', '{']).next().unwrap_or_default().to_owned()
 }
 
 fn check(
@@ -240,36 +346,6 @@ fn check(
         }
     }
     Ok(())
-}
-
-#[allow(clippy::too_many_arguments)]
-fn correlate_at(
-    level: Level,
-    scalar: bool,
-    reference: &Reference,
-    target: &Target,
-    points: &Points,
-    guess: &Guess<'_>,
-    settings: &Settings,
-    observer: &dyn Observer,
-) -> Result<Correlation, CorrelateError> {
-    check(reference, target, points, guess, settings)?;
-    let start = Instant::now();
-    observer.stage(Stage::Init);
-    let mut solver = Solver::new(reference, target, settings, level);
-    solver.scalar = scalar;
-    let mut run = Propagation::new(&solver, points, observer);
-    let seeds = run.start(guess);
-    let init = start.elapsed();
-    observer.stage(Stage::Solve);
-    run.finish(seeds, guess);
-    if observer.cancelled() {
-        return Err(CorrelateError::Cancelled { done: run.done(), total: points.len() });
-    }
-    let mut outcomes = run.outcomes;
-    consistency::judge(&solver, points, &mut outcomes);
-    let points = outcomes.iter().enumerate().map(|(k, o)| point(points, k, o.as_ref())).collect();
-    Ok(Correlation { points, timing: Timing { init, solve: start.elapsed() - init } })
 }
 
 fn point(points: &Points, k: usize, outcome: Option<&Outcome>) -> Point {

@@ -11,7 +11,8 @@ use crate::scalar;
 use crate::settings::{Interpolation, Settings};
 use crate::shape::{Shape, Warp};
 use crate::subset::{Layout, Subset};
-use fearless_simd::{Level, dispatch, prelude::*};
+use crate::simd::dispatch;
+use fearless_simd::{Level, prelude::*};
 use fearless_simd_macros::simd;
 
 /// How far, in pixels, the iteration may overhang the deformed image before it is given up; the
@@ -163,71 +164,98 @@ impl<'a> Solver<'a> {
         significant(self.settings.significance, independent).min(0.9).max(self.settings.min_zncc)
     }
 
+    /// Judges a converged subset by itself: independent speckles and standard uncertainties where it
+    /// is accepted.
+    #[inline(always)]
+    pub(crate) fn verdict(
+        &self,
+        (x, y): (i32, i32),
+        warp: &Warp,
+        numbers: &Numbers,
+    ) -> Result<(f64, [f32; 2]), Status> {
+        let independent = self.independent(numbers);
+        if !self.inside(x, y, warp, BORDER) {
+            Err(Status::OutOfImage)
+        } else if numbers.zncc < self.threshold(independent) {
+            Err(Status::LowCorrelation)
+        } else if warp.log_stretch() > self.settings.max_log_stretch {
+            Err(Status::Distorted)
+        } else {
+            Ok((independent, self.sigma(warp, numbers)))
+        }
+    }
+
     /// Number of independent speckles in the subset: two unrelated fields of correlation lengths s
     /// (autocorrelation exp(−d²/2s²) each, s² = Σf²/Σf_x²) have a ZNCC of variance π s_x s_y / n
     /// over n pixels.
-    fn independent(&self, subset: &Subset) -> f64 {
+    fn independent(&self, numbers: &Numbers) -> f64 {
         let n = self.layout.count() as f64;
-        let gxx = subset.products[0][0].max(f64::MIN_POSITIVE);
-        let gyy = subset.products[2][0].max(f64::MIN_POSITIVE);
-        n * (gxx * gyy).sqrt() / (std::f64::consts::PI * subset.sff)
+        let [gxx, gyy] = numbers.energy.map(|e| e.max(f64::MIN_POSITIVE));
+        n * (gxx * gyy).sqrt() / (std::f64::consts::PI * numbers.sff)
     }
 
-    /// Standard uncertainties of u and v at an offset from the centre, from the inverse normal
-    /// matrix; gain and offset of the grey levels are free.
-    fn sigma(
-        &self,
-        subset: &Subset,
-        normal: &Normal,
-        warp: &Warp,
-        offset: [f64; 2],
-        zncc: f64,
-        gain: f64,
-    ) -> [f32; 2] {
+    /// Standard uncertainties of u and v; gain and offset of the grey levels are free.
+    fn sigma(&self, warp: &Warp, numbers: &Numbers) -> [f32; 2] {
         let n = self.layout.count() as f64;
         let r = self.layout.radius as f64;
         let m = self.settings.shape.parameters_per_component();
+        let Numbers { sff, energy, variance, zncc, gain } = *numbers;
         // variance of the residual f − gain g if both images had the noise of whole pixels
         let (residual, noise_f) = match self.settings.noise {
             Some(s) => (s * s * (1.0 + gain * gain), s * s),
             None => {
                 let freedom = (n - 2.0 - 2.0 * m as f64).max(1.0);
-                let raw = 2.0 * subset.sff * (1.0 - zncc).max(0.0) / freedom;
-                let mut energy = 0.0;
-                for eta in [-0.7 * r, 0.0, 0.7 * r] {
-                    for xi in [-0.7 * r, 0.0, 0.7 * r] {
-                        let d = warp.at(xi, eta);
-                        energy += self.noise.interpolated(d[0], d[1]) / 9.0;
-                    }
-                }
-                let s2 = raw * 2.0 / (1.0 + energy);
+                let raw = 2.0 * sff * (1.0 - zncc).max(0.0) / freedom;
+                let s2 = raw * 2.0 / (1.0 + self.noise.interpolated_over(warp, r));
                 (s2, 0.5 * s2)
             }
         };
+        let mut out = [f32::NAN; 2];
+        for (c, o) in out.iter_mut().enumerate() {
+            // Noise in the gradients makes the normal matrix look better than it is: with H the one
+            // seen and H₀ = H (1 − excess) the true one, the variance is s² (H₀ + H) / 2 / H₀². Only
+            // the deformed image's noise meets that of the gradients at random; the reference's own
+            // product f f_x sums to nothing.
+            let excess = n * self.noise.gradient * noise_f / energy[c];
+            let honest = (1.0 - excess).max(0.2);
+            let loss = 0.5 * (1.0 + honest) / (honest * honest);
+            *o = (residual * loss * variance[c]).max(0.0).sqrt() as f32;
+        }
+        out
+    }
+
+    /// Variances of u and v at an offset from the centre per unit of residual variance, from the
+    /// inverse normal matrix; gain and offset of the grey levels are free.
+    fn variance(&self, subset: &Subset, normal: &Normal, offset: [f64; 2]) -> [f64; 2] {
+        let r = self.layout.radius as f64;
+        let m = self.settings.shape.parameters_per_component();
         let (dx, dy) = (offset[0] / r, offset[1] / r);
         let basis = [1.0, dx, dy, dx * dx, dx * dy, dy * dy];
         let mut slopes_f = [0.0; MAX];
         slopes_f[..m].copy_from_slice(&subset.slopes_f[0][..m]);
         slopes_f[m..2 * m].copy_from_slice(&subset.slopes_f[1][..m]);
         let coupled = normal.solve(slopes_f);
-        let mut out = [f32::NAN; 2];
-        for (c, o) in out.iter_mut().enumerate() {
+        [0, 1].map(|c| {
             let mut b = [0.0; MAX];
             b[c * m..c * m + m].copy_from_slice(&basis[..m]);
             let own = normal.quadratic_form(b);
             let through_gain: f64 = b.iter().zip(&coupled).map(|(a, e)| a * e).sum();
-            // Noise in the gradients makes the normal matrix look better than it is: with H the one
-            // seen and H₀ = H (1 − excess) the true one, the variance is s² (H₀ + H) / 2 / H₀². Only
-            // the deformed image's noise meets that of the gradients at random; the reference's own
-            // product f f_x sums to nothing.
-            let excess = n * self.noise.gradient * noise_f / subset.products[2 * c][0];
-            let honest = (1.0 - excess).max(0.2);
-            let loss = 0.5 * (1.0 + honest) / (honest * honest);
-            let variance = residual * loss * (own + through_gain * through_gain / subset.sff);
-            *o = variance.max(0.0).sqrt() as f32;
-        }
-        out
+            own + through_gain * through_gain / subset.sff
+        })
     }
+}
+
+/// What a verdict on a subset rests on.
+pub(crate) struct Numbers {
+    /// Σ (f − mean)².
+    pub(crate) sff: f64,
+    /// Σ fx², Σ fy².
+    pub(crate) energy: [f64; 2],
+    /// Variances of u and v per unit of residual variance.
+    pub(crate) variance: [f64; 2],
+    pub(crate) zncc: f64,
+    /// From deformed to reference grey levels.
+    pub(crate) gain: f64,
 }
 
 #[simd]
@@ -269,7 +297,6 @@ fn iterate<S: Simd, const N: usize, const N1: usize, const O: usize>(
         return Outcome::failed(Status::Singular, warp);
     };
     let mut out = Outcome::failed(Status::NotConverged, warp);
-    out.independent = solver.independent(subset);
     let mut gain = 1.0;
     while u32::from(out.iterations) < settings.max_iterations {
         if !solver.inside(x, y, &warp, OVERHANG) {
@@ -313,16 +340,17 @@ fn iterate<S: Simd, const N: usize, const N1: usize, const O: usize>(
     }
     out.warp = warp;
     if out.status == Status::Converged {
-        out.sigma = solver.sigma(subset, normal, &warp, offset, out.zncc, gain);
-        out.status = if !solver.inside(x, y, &warp, BORDER) {
-            Status::OutOfImage
-        } else if out.zncc < solver.threshold(out.independent) {
-            Status::LowCorrelation
-        } else if warp.log_stretch() > settings.max_log_stretch {
-            Status::Distorted
-        } else {
-            Status::Converged
+        let numbers = Numbers {
+            sff: subset.sff,
+            energy: [subset.products[0][0], subset.products[2][0]],
+            variance: solver.variance(subset, normal, offset),
+            zncc: out.zncc,
+            gain,
         };
+        match solver.verdict((x, y), &warp, &numbers) {
+            Ok((independent, sigma)) => (out.independent, out.sigma) = (independent, sigma),
+            Err(status) => out.status = status,
+        }
     }
     out
 }

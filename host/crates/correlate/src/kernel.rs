@@ -257,7 +257,8 @@ mod tests {
     use crate::prepared::Reference;
     use crate::scalar;
     use crate::settings::Interpolation;
-    use fearless_simd::{Level, dispatch};
+    use crate::simd::dispatch;
+    use fearless_simd::Level;
 
     /// A texture without symmetry.
     fn texture() -> Image {

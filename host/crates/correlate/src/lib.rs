@@ -11,6 +11,7 @@
 
 mod consistency;
 mod correlate;
+mod dense;
 mod fft;
 mod icgn;
 mod image;
@@ -26,11 +27,13 @@ mod sampler;
 mod scalar;
 mod settings;
 mod shape;
+mod simd;
 mod subset;
 mod views;
 
 pub use correlate::{
-    CorrelateError, Correlation, Guess, Observer, Stage, Timing, correlate, correlate_scalar, simd_level,
+    CorrelateError, Correlation, Guess, Observer, Stage, Timing, Workspace, correlate, correlate_scalar,
+    simd_level,
 };
 pub use image::{Image, ImageError, Mask};
 pub use point::{Point, ShapeParameters, SolvedBy, Status};

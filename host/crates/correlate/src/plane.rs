@@ -2,7 +2,8 @@
 
 use crate::image::Image;
 use crate::settings::Interpolation;
-use fearless_simd::{Level, dispatch, f32x8, prelude::*};
+use crate::simd::dispatch;
+use fearless_simd::{Level, f32x8, prelude::*};
 use fearless_simd_macros::simd;
 
 /// Pixels added on every side. The slowest pole (0.43) has died out to 2e-12 over this distance,
@@ -51,6 +52,15 @@ impl Plane {
                 *o = src[mirror(x, w)] - minus;
             }
         }
+    }
+
+    /// Index of a pixel that may lie outside the padding: such an index is out of range, or that of
+    /// another pixel of the plane.
+    #[inline(always)]
+    pub(crate) fn signed_index(&self, x: i32, y: i32) -> usize {
+        (y.wrapping_add(PAD as i32) as isize)
+            .wrapping_mul(self.stride as isize)
+            .wrapping_add(x.wrapping_add(PAD as i32) as isize) as usize
     }
 
     /// Index of pixel (x, y) of the image.

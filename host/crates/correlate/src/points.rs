@@ -235,6 +235,13 @@ impl Points {
         Ok(Self { xy, grid: None, starts, neighbours })
     }
 
+    /// Some of the points, with neighbours of their own.
+    pub(crate) fn selected(&self, which: &[usize]) -> Self {
+        let xy: Vec<[f64; 2]> = which.iter().map(|&k| self.xy[k]).collect();
+        let (starts, neighbours) = nearest(&xy);
+        Self { xy, grid: None, starts, neighbours }
+    }
+
     /// Number of points.
     pub fn len(&self) -> usize {
         self.xy.len()

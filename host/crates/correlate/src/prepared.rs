@@ -4,6 +4,7 @@ use crate::image::Image;
 use crate::plane::{self, Plane};
 use crate::settings::Interpolation;
 use fearless_simd::Level;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// The reference image with its gradients (derivatives of the interpolating quintic B-spline).
 #[derive(Clone)]
@@ -11,7 +12,14 @@ pub struct Reference {
     pub(crate) image: Image,
     pub(crate) gx: Plane,
     pub(crate) gy: Plane,
+    /// Mean grey level.
+    pub(crate) mean: f32,
+    /// Differs between any two contents of any two references.
+    pub(crate) id: u64,
 }
+
+/// Identities given out so far.
+static IDENTITIES: AtomicU64 = AtomicU64::new(0);
 
 /// The deformed image with the coefficients of its interpolating B-spline.
 #[derive(Clone)]
@@ -26,35 +34,38 @@ pub struct Target {
 impl Reference {
     /// Prepares a reference image.
     pub fn new(image: Image) -> Self {
-        let (mut gx, mut gy) = (Plane::default(), Plane::default());
-        gradients(&image, &mut gx, &mut gy);
-        Self { image, gx, gy }
+        let mut new = Self { image, gx: Plane::default(), gy: Plane::default(), mean: 0.0, id: 0 };
+        new.prepare();
+        new
     }
 
     /// Replaces the image; memory is used again where the size allows.
     pub fn update(&mut self, image: Image) {
         self.image = image;
-        gradients(&self.image, &mut self.gx, &mut self.gy);
+        self.prepare();
+    }
+
+    fn prepare(&mut self) {
+        self.id = IDENTITIES.fetch_add(1, Ordering::Relaxed);
+        self.mean = self.image.mean();
+        let (level, mean) = (Level::new(), self.mean);
+        let Self { image, gx, gy, .. } = self;
+        rayon::join(
+            || {
+                gx.load(image, mean);
+                plane::gradient_x(level, gx);
+            },
+            || {
+                gy.load(image, mean);
+                plane::gradient_y(level, gy);
+            },
+        );
     }
 
     /// The image.
     pub fn image(&self) -> &Image {
         &self.image
     }
-}
-
-fn gradients(image: &Image, gx: &mut Plane, gy: &mut Plane) {
-    let (level, mean) = (Level::new(), image.mean());
-    rayon::join(
-        || {
-            gx.load(image, mean);
-            plane::gradient_x(level, gx);
-        },
-        || {
-            gy.load(image, mean);
-            plane::gradient_y(level, gy);
-        },
-    );
 }
 
 impl Target {

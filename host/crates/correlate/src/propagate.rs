@@ -8,7 +8,7 @@
 use crate::correlate::{Guess, Observer};
 use crate::fft::{Search, Window, global_shifts};
 use crate::icgn::{Outcome, Scratch, Solver};
-use crate::point::Status;
+use crate::point::{SolvedBy, Status};
 use crate::points::Points;
 use crate::shape::Warp;
 use rayon::prelude::*;
@@ -28,9 +28,9 @@ const BATCH: usize = 64;
 
 /// State of a run.
 pub(crate) struct Propagation<'a> {
-    solver: &'a Solver<'a>,
-    points: &'a Points,
-    observer: &'a dyn Observer,
+    pub(crate) solver: &'a Solver<'a>,
+    pub(crate) points: &'a Points,
+    pub(crate) observer: &'a dyn Observer,
     pub(crate) outcomes: Vec<Option<Outcome>>,
     done: usize,
     globals: Vec<[f64; 2]>,
@@ -272,6 +272,35 @@ impl<'a> Propagation<'a> {
         let ((xb, yb), _) = self.points.centre(to);
         let o = self.outcomes[from]?;
         Some(o.warp.moved(f64::from(xb - xa), f64::from(yb - ya)))
+    }
+
+    /// Solves what the dense form has left: first the points for which it proposes a start.
+    pub(crate) fn complete(&mut self, proposals: &[(usize, Warp)], guess: &Guess<'_>, sparse: Propagation<'_>) {
+        self.globals = sparse.globals;
+        self.done = self.outcomes.iter().filter(|o| o.is_some()).count();
+        let tasks: Vec<Task> = proposals.iter().map(|&(point, warp)| Task { point, warp }).collect();
+        self.solve(&tasks);
+        let open = |&k: &usize| {
+            self.accepted(k) && self.points.neighbours(k).iter().any(|&c| self.outcomes[c as usize].is_none())
+        };
+        let front: Vec<usize> = (0..self.points.len()).filter(open).collect();
+        self.finish(front, guess);
+    }
+
+    /// Marks the points that the dense form does not answer for.
+    pub(crate) fn give_up(&mut self, proposals: &[(usize, Warp)]) {
+        let mut warps = proposals.iter().peekable();
+        for (k, outcome) in self.outcomes.iter_mut().enumerate() {
+            let proposed = warps.next_if(|p| p.0 == k).map(|p| p.1);
+            if outcome.is_none() {
+                let warp = proposed.unwrap_or(Warp::translation(0.0, 0.0));
+                let mut o = Outcome::failed(Status::NotConverged, warp);
+                o.solver = SolvedBy::Dense;
+                *outcome = Some(o);
+            }
+        }
+        self.done = self.outcomes.len();
+        self.observer.points(self.done, self.points.len());
     }
 
     /// Propagation, second attempts, and new seeds where propagation has not come.

@@ -10,7 +10,7 @@ const LANES: usize = 8;
 /// pixel given as t − ½. In this variable tap k and tap N−1−k share their even part and differ in
 /// the sign of the odd one. Both axes go side by side so that they share the constants.
 #[inline(always)]
-fn weights<S: Simd, const N: usize>(s: S, x: V<S>, y: V<S>) -> ([V<S>; 7], [V<S>; 7]) {
+pub(crate) fn weights<S: Simd, const N: usize>(s: S, x: V<S>, y: V<S>) -> ([V<S>; 7], [V<S>; 7]) {
     let k = |a: f32| V::splat(s, a);
     let (q, p) = (x * x, y * y);
     let mut w = [k(0.0); 7];
@@ -41,7 +41,7 @@ fn weights<S: Simd, const N: usize>(s: S, x: V<S>, y: V<S>) -> ([V<S>; 7], [V<S>
 
 /// Lanes whose integer part is one larger use the same taps, shifted by one.
 #[inline(always)]
-fn shifted<S: Simd, const N: usize>(s: S, w: [V<S>; 7], m: mask32x8<S>) -> [V<S>; 7] {
+pub(crate) fn shifted<S: Simd, const N: usize>(s: S, w: [V<S>; 7], m: mask32x8<S>) -> [V<S>; 7] {
     let zero = V::splat(s, 0.0);
     let mut o = [zero; 7];
     o[0] = m.select(zero, w[0]);
@@ -55,7 +55,7 @@ fn shifted<S: Simd, const N: usize>(s: S, w: [V<S>; 7], m: mask32x8<S>) -> [V<S>
 /// Weighted sum over NX × NY taps; lane l reads from `origin + l`. Nothing where the taps are not
 /// all in the plane.
 #[inline(always)]
-fn convolve<S: Simd, const NX: usize, const NY: usize>(
+pub(crate) fn convolve<S: Simd, const NX: usize, const NY: usize>(
     s: S,
     plane: &Plane,
     origin: usize,

@@ -1,0 +1,382 @@
+//! One dense pass: every pixel is warped once with the common field, and the normal equations of
+//! all overlapping subsets follow from window sums.
+//!
+//! With w(x) the common field and p(x) the polynomial of one subset, to first order
+//! g(x + p) = g(x + w) + ∇f·δ, (I + ∇w) δ = p − w. Minimising ZNSSD over p then needs only window
+//! sums of G r and G h, with r = f − g(x + w) and h = ∇f·(I + A)⁻¹(w − w₀). That w is not the
+//! subset's own polynomial is not neglected, only the square of the difference is.
+
+use super::nodes::Nodes;
+use super::reference::{self, FIELD_BLOCK, Prepared, corner};
+use super::sums::{Group, SumBuffers, flush};
+use super::tiling::{DEGREES, LANES, Task, Tiling, moments};
+use super::warp::warp_row;
+use crate::plane::Plane;
+use crate::sampler::V;
+use crate::settings::Criterion;
+use crate::simd::dispatch;
+use fearless_simd::{Level, prelude::*};
+use fearless_simd_macros::simd;
+
+/// What a pass leaves for eight neighbouring subsets, in vectors: the increments of the parameters
+/// (in (I + A)⁻¹ p − w₀, coordinates ξ/r and η/r), then these.
+pub(crate) const ZNCC: usize = 0;
+/// Gain from deformed to reference grey levels.
+pub(crate) const GAIN: usize = 1;
+/// Largest distance, in pixels, between the subset's polynomial and the field it was solved in.
+pub(crate) const DISTANCE: usize = 2;
+const EXTRA: usize = 3;
+
+/// Vectors per eight subsets.
+pub(crate) const fn outputs(order: usize) -> usize {
+    2 * moments(order) + EXTRA
+}
+
+/// Working memory of one thread.
+#[derive(Default)]
+pub(crate) struct Buffers {
+    pub(crate) sums: SumBuffers,
+    rows: Rows,
+}
+
+/// One row of pixels.
+#[derive(Default)]
+struct Rows {
+    /// Displacement at each pixel.
+    u: Vec<f32>,
+    v: Vec<f32>,
+    /// Deformed image, in the order of the pixels and of the tiles.
+    g: Vec<f32>,
+    g_split: Vec<f32>,
+    /// Field of the equations at the nodes of this row, and its difference to the next node.
+    nodes: [Vec<f32>; 4],
+}
+
+/// What is common to all tasks of a pass.
+pub(crate) struct Pass<'a> {
+    pub(crate) tiling: &'a Tiling,
+    pub(crate) nodes: &'a Nodes,
+    pub(crate) plane: &'a Plane,
+    /// Reference grey levels hold f − `f_offset`, coefficients g − `g_offset`.
+    pub(crate) criterion: Criterion,
+    /// Taps of the spline: 6 or 4.
+    pub(crate) taps: usize,
+    pub(crate) order: usize,
+}
+
+impl Pass<'_> {
+    pub(crate) fn run(
+        &self,
+        level: Level,
+        task: &Task,
+        data: &Prepared,
+        buffers: &mut Buffers,
+        out: &mut Vec<f32>,
+    ) {
+        out.resize(task.rows * task.width * outputs(self.order), 0.0);
+        macro_rules! go {
+            ($n:literal, $n1:literal, $o:literal) => {
+                dispatch!(level, s => run::<_, $n, $n1, $o>(s, self, task, data, buffers, out))
+            };
+        }
+        match (self.taps, self.order) {
+            (6, 0) => go!(6, 7, 0),
+            (6, 1) => go!(6, 7, 1),
+            (6, _) => go!(6, 7, 2),
+            (_, 0) => go!(4, 5, 0),
+            (_, 1) => go!(4, 5, 1),
+            (_, _) => go!(4, 5, 2),
+        }
+    }
+}
+
+#[simd]
+fn run<S: Simd, const N: usize, const N1: usize, const O: usize>(
+    s: S,
+    pass: &Pass<'_>,
+    task: &Task,
+    data: &Prepared,
+    buffers: &mut Buffers,
+    out: &mut [f32],
+) {
+    let tiling = pass.tiling;
+    let groups = [Group { count: 4, degree: O }, Group { count: 4, degree: 0 }];
+    let planes = groups.iter().map(|g| g.planes()).sum();
+    let Buffers { sums, rows } = buffers;
+    sums.prepare(tiling, task, planes);
+    rows.prepare(tiling, task);
+    let powers: Vec<[f32; DEGREES]> = (0..tiling.step).map(|p| tiling.powers(p)).collect();
+    // per phase: the node left of it, counted from the tile's, and the way from there to the next
+    let lead = tiling.lead();
+    let phases: Vec<(usize, f32)> = (0..tiling.step)
+        .map(|p| ((p + lead) / tiling.step, ((p + lead) % tiling.step) as f32 / tiling.step as f32))
+        .collect();
+    let rem = tiling.whole().1;
+    let row_floats = task.tiles * tiling.step * 3;
+    let last = tiling.last();
+    let mut fields = data.fields.chunks_exact(row_floats);
+    let block = reference::Layout::new(O).len() * LANES;
+    let (x, y) = corner(tiling, task);
+    let (x, y) = (x + pass.nodes.base[0], y + pass.nodes.base[1]);
+    let mut line = 0;
+    for b in 0..task.rows + last {
+        sums.begin();
+        let whole = b + 1 < task.rows + last || rem == 0;
+        let mut summed = 0;
+        while summed < if whole { tiling.step } else { rem } {
+            if summed == rem {
+                sums.keep_part();
+            }
+            if let Some(f) = fields.next() {
+                rows.field(s, tiling, task, pass.nodes, line);
+                let Rows { u, v, g, g_split, nodes } = &mut *rows;
+                warp_row::<S, N, N1>(s, pass.plane, x, y + line as i32, &u[lead..], &v[lead..], g);
+                reference::split(tiling.step, g, LANES, g_split);
+                let stride = task.tiles;
+                let input = Input { fields: f, g: g_split, nodes, phases: &phases, x: &powers, rem };
+                accumulate::<S, O>(s, &input, &powers[summed], &mut sums.tiles, stride);
+            }
+            line += 1;
+            summed += 1;
+        }
+        if !whole {
+            sums.keep_part();
+        }
+        sums.close(s, tiling, task, &groups, b, whole);
+        if b >= last {
+            sums.subsets(s, tiling, task, &groups, b);
+            let j = b - last;
+            let vectors = task.width / LANES;
+            let constants = &data.constants[j * vectors * block..(j + 1) * vectors * block];
+            let size = outputs(O) * LANES;
+            let out = &mut out[j * vectors * size..(j + 1) * vectors * size];
+            for (group, (c, o)) in constants.chunks_exact(block).zip(out.chunks_exact_mut(size)).enumerate() {
+                increments::<S, O>(s, pass, &sums.subsets, task.width, group * LANES, c, o);
+                distance::<S, O>(s, pass, task, j, group * LANES, o);
+            }
+        }
+    }
+}
+
+impl Rows {
+    fn prepare(&mut self, tiling: &Tiling, task: &Task) {
+        let pixels = task.tiles * tiling.step;
+        // stores of whole vectors run over the last node
+        let wide = pixels + 2 * tiling.step + 2 * LANES;
+        self.u.resize(wide, 0.0);
+        self.v.resize(wide, 0.0);
+        self.g.resize(pixels, 0.0);
+        self.g_split.resize(pixels, 0.0);
+        for n in &mut self.nodes {
+            n.resize(task.tiles + 2, 0.0);
+        }
+    }
+
+    /// The field along row `line` of the task's pixels: at each pixel, and at the nodes for the
+    /// equations.
+    #[inline(always)]
+    fn field<S: Simd>(&mut self, s: S, tiling: &Tiling, task: &Task, nodes: &Nodes, line: usize) {
+        let step = tiling.step;
+        let down = line + tiling.lead();
+        let t = (down % step) as f32 / step as f32;
+        let at = (task.row + down / step) * nodes.stride + task.column;
+        let n = task.tiles + 2;
+        let (upper, lower) = (at..at + n + 1, at + nodes.stride..at + nodes.stride + n + 1);
+        let lanes = V::from_fn(s, |l| l as f32);
+        let inv = 1.0 / step as f32;
+        for (field, out) in [(&nodes.u, &mut self.u), (&nodes.v, &mut self.v)] {
+            let (a, b) = (&field[upper.clone()], &field[lower.clone()]);
+            let mut value = (b[0] - a[0]).mul_add(t, a[0]);
+            for i in 0..n - 1 {
+                let next = (b[i + 1] - a[i + 1]).mul_add(t, a[i + 1]);
+                let (start, slope) = (V::splat(s, value), V::splat(s, (next - value) * inv));
+                let mut k = 0;
+                while k < step {
+                    let o = i * step + k;
+                    let x = lanes + V::splat(s, k as f32);
+                    slope.mul_add(x, start).store_slice(&mut out[o..o + LANES]);
+                    k += LANES;
+                }
+                value = next;
+            }
+        }
+        let [nu, du, nv, dv] = &mut self.nodes;
+        for (field, out, difference) in [(&nodes.cu, nu, du), (&nodes.cv, nv, dv)] {
+            let (a, b) = (&field[upper.clone()], &field[lower.clone()]);
+            for i in 0..n {
+                out[i] = (b[i] - a[i]).mul_add(t, a[i]);
+            }
+            for i in 0..n - 1 {
+                difference[i] = out[i + 1] - out[i];
+            }
+        }
+    }
+}
+
+struct Input<'a> {
+    fields: &'a [f32],
+    g: &'a [f32],
+    nodes: &'a [Vec<f32>; 4],
+    phases: &'a [(usize, f32)],
+    x: &'a [[f32; DEGREES]],
+    rem: usize,
+}
+
+/// Adds one row of pixels to the tiles: fx r, fy r, fx h, fy h; r, h, r², f r.
+#[inline(always)]
+fn accumulate<S: Simd, const O: usize>(
+    s: S,
+    input: &Input<'_>,
+    y: &[f32; DEGREES],
+    tiles: &mut [f32],
+    stride: usize,
+) {
+    let zero = V::splat(s, 0.0);
+    let step = input.phases.len();
+    let half = tiles.len() / 2;
+    let (whole, part) = tiles.split_at_mut(half);
+    let rem = input.rem;
+    let [nu, du, nv, dv] = input.nodes;
+    let blocks = input.fields.chunks_exact(step * FIELD_BLOCK).zip(input.g.chunks_exact(step * LANES));
+    for (group, (block, g)) in blocks.enumerate() {
+        let k = group * LANES;
+        let window = k..k + LANES + 2;
+        let (nu, du) = (&nu[window.clone()], &du[window.clone()]);
+        let (nv, dv) = (&nv[window.clone()], &dv[window]);
+        let mut a = [[zero; O_MAX]; 4];
+        let mut q = [zero; 4];
+        let (f0, f1) = block.split_at(rem * FIELD_BLOCK);
+        let (g0, g1) = g.split_at(rem * LANES);
+        let (p0, p1) = input.phases.split_at(rem);
+        let (x0, x1) = input.x.split_at(rem);
+        for (is_part, f, g, phases, x) in [(true, f0, g0, p0, x0), (false, f1, g1, p1, x1)] {
+            let pixels = f.chunks_exact(FIELD_BLOCK).zip(g.chunks_exact(LANES)).zip(phases).zip(x);
+            for (((f, g), &(node, t)), x) in pixels {
+                let fv = V::from_slice(s, &f[..LANES]);
+                let xv = V::from_slice(s, &f[LANES..2 * LANES]);
+                let yv = V::from_slice(s, &f[2 * LANES..]);
+                let t = V::splat(s, t);
+                macro_rules! at {
+                    ($n:expr) => {
+                        V::from_slice(s, &$n[node..node + LANES])
+                    };
+                }
+                let u = t.mul_add(at!(du), at!(nu));
+                let v = t.mul_add(at!(dv), at!(nv));
+                let h = xv.mul_add(u, yv * v);
+                let r = fv - V::from_slice(s, g);
+                let products = [xv * r, yv * r, xv * h, yv * h];
+                for c in 0..4 {
+                    a[c][0] += products[c];
+                    for i in 1..=O {
+                        a[c][i] = products[c].mul_add(V::splat(s, x[i]), a[c][i]);
+                    }
+                }
+                q[0] += r;
+                q[1] += h;
+                q[2] = r.mul_add(r, q[2]);
+                q[3] = fv.mul_add(r, q[3]);
+            }
+            if is_part && rem == 0 {
+                continue;
+            }
+            let mut planes = if is_part { &mut *part } else { &mut *whole };
+            for c in &a {
+                flush::<S, O>(s, c, y, planes, stride, k);
+                planes = &mut planes[moments(O) * stride..];
+            }
+            for c in &q {
+                flush::<S, 0>(s, std::slice::from_ref(c), y, planes, stride, k);
+                planes = &mut planes[stride..];
+            }
+        }
+    }
+}
+
+const O_MAX: usize = 3;
+
+/// Solves eight subsets.
+#[inline(always)]
+fn increments<S: Simd, const O: usize>(
+    s: S,
+    pass: &Pass<'_>,
+    sums: &[f32],
+    stride: usize,
+    k: usize,
+    constants: &[f32],
+    out: &mut [f32],
+) {
+    let layout = reference::Layout::new(O);
+    let m = moments(O);
+    let p = 2 * m;
+    macro_rules! at {
+        ($plane:expr) => {{
+            let o = ($plane) * stride + k;
+            V::from_slice(s, &sums[o..o + LANES])
+        }};
+    }
+    macro_rules! constant {
+        ($index:expr) => {{
+            let o = ($index) * LANES;
+            V::from_slice(s, &constants[o..o + LANES])
+        }};
+    }
+    let width = (2 * pass.tiling.radius + 1) as f32;
+    let inv_n = V::splat(s, 1.0 / (width * width));
+    let one = V::splat(s, 1.0);
+    let (r, h, rr, fr) = (at!(2 * p), at!(2 * p + 1), at!(2 * p + 2), at!(2 * p + 3));
+    let (mr, mh) = (r * inv_n, h * inv_n);
+    let sff = constant!(layout.sff());
+    let srr = rr - r * mr;
+    let sfr = fr - constant!(layout.mean()) * r;
+    let sgg = (sff - sfr - sfr + srr).max(V::splat(s, 1e-20));
+    let zncc = (sff - sfr) / (sff * sgg).sqrt();
+    let gain = match pass.criterion {
+        Criterion::Znssd => (sff / sgg).sqrt(),
+        Criterion::Zssd => one,
+    };
+    let mut b = [V::splat(s, 0.0); 12];
+    for a in 0..p {
+        let g = constant!(layout.g() + a);
+        let (gr, gh) = (at!(a) - mr * g, at!(p + a) - mh * g);
+        b[a] = (one - gain) * constant!(layout.gf() + a) + gain.mul_add(gr, gh);
+    }
+    let b = reference::solve::<S, O>(s, constants, b);
+    for a in 0..p {
+        b[a].store_slice(&mut out[a * LANES..(a + 1) * LANES]);
+    }
+    zncc.store_slice(&mut out[(p + ZNCC) * LANES..][..LANES]);
+    gain.store_slice(&mut out[(p + GAIN) * LANES..][..LANES]);
+}
+
+/// Largest difference between eight subsets' polynomials and the field, over the nodes next to the
+/// subset's corners and the middles of its sides.
+#[inline(always)]
+fn distance<S: Simd, const O: usize>(s: S, pass: &Pass<'_>, task: &Task, j: usize, k: usize, out: &mut [f32]) {
+    let tiling = pass.tiling;
+    let m = moments(O);
+    let e = tiling.margin();
+    let reach = (tiling.radius / tiling.step).max(1).min(e) as i32;
+    let mut worst = V::splat(s, 0.0);
+    let scale = tiling.step as f32 / tiling.radius as f32;
+    macro_rules! parameter {
+        ($a:expr) => {
+            V::from_slice(s, &out[($a) * LANES..($a) * LANES + LANES])
+        };
+    }
+    for (dx, dy) in [(0, 0), (-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)] {
+        let (i, l) = ((dx * reach) as f32 * scale, (dy * reach) as f32 * scale);
+        let basis = [1.0, i, l, i * i, i * l, l * l];
+        let row = (task.row + j + e) as i32 + dy * reach;
+        let column = (task.column + k + e) as i32 + dx * reach;
+        let at = row as usize * pass.nodes.stride + column as usize;
+        for (c, field) in [&pass.nodes.cu, &pass.nodes.cv].into_iter().enumerate() {
+            let mut d = V::splat(s, 0.0) - V::from_slice(s, &field[at..at + LANES]);
+            for a in 0..m {
+                d = V::splat(s, basis[a]).mul_add(parameter!(c * m + a), d);
+            }
+            worst = worst.max(d.abs());
+        }
+    }
+    worst.store_slice(&mut out[(2 * m + DISTANCE) * LANES..][..LANES]);
+}
