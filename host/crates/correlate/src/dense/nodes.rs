@@ -50,9 +50,6 @@ impl Affine {
     }
 }
 
-/// Result of one point, seen from the grid: displacement and its gradients at the node, or nothing.
-pub(crate) type Known = Option<Warp>;
-
 impl Nodes {
     fn resize(&mut self, tiling: &Tiling) {
         let e = tiling.margin();

@@ -131,7 +131,7 @@ fn run<S: Simd, const N: usize, const N1: usize, const O: usize>(
                 rows.field(s, tiling, task, pass.nodes, line);
                 let Rows { u, v, g, g_split, nodes } = &mut *rows;
                 warp_row::<S, N, N1>(s, pass.plane, x, y + line as i32, &u[lead..], &v[lead..], g);
-                reference::split(tiling.step, g, LANES, g_split);
+                reference::split(tiling.step, g, LANES, 0, g_split);
                 let stride = task.tiles;
                 let input = Input { fields: f, g: g_split, nodes, phases: &phases, x: &powers, rem };
                 accumulate::<S, O>(s, &input, &powers[summed], &mut sums.tiles, stride);

@@ -86,10 +86,10 @@ pub(crate) fn corner(tiling: &Tiling, task: &Task) -> (i32, i32) {
     (x, y)
 }
 
-/// Sorts values that follow each other along x into blocks of eight tiles, phase after phase:
-/// `out[(tile / 8, phase, 0, tile % 8)]`, blocks of `width` floats per phase.
+/// Sorts values that follow each other along x into blocks of eight tiles, phase after phase: `width`
+/// floats per phase, of which the eight from `offset` on are written.
 #[inline(always)]
-pub(crate) fn split(step: usize, row: &[f32], width: usize, out: &mut [f32]) {
+pub(crate) fn split(step: usize, row: &[f32], width: usize, offset: usize, out: &mut [f32]) {
     macro_rules! fixed {
         ($($n:literal)*) => {
             match step {
@@ -97,7 +97,7 @@ pub(crate) fn split(step: usize, row: &[f32], width: usize, out: &mut [f32]) {
                     let (src, _) = row.as_chunks::<{ $n * LANES }>();
                     for (src, dst) in src.iter().zip(out.chunks_exact_mut($n * width)) {
                         for (phase, d) in dst.chunks_exact_mut(width).enumerate() {
-                            if let Some(d) = d.first_chunk_mut::<LANES>() {
+                            if let Some(d) = d[offset..].first_chunk_mut::<LANES>() {
                                 for l in 0..LANES {
                                     d[l] = src[(l * $n + phase).min($n * LANES - 1)];
                                 }
@@ -113,7 +113,7 @@ pub(crate) fn split(step: usize, row: &[f32], width: usize, out: &mut [f32]) {
     fixed!(1 2 3 4 5 6 7 8 10);
     for (src, dst) in row.chunks_exact(step * LANES).zip(out.chunks_exact_mut(step * width)) {
         for (phase, d) in dst.chunks_exact_mut(width).enumerate() {
-            for (l, v) in d.iter_mut().take(LANES).enumerate() {
+            for (l, v) in d[offset..].iter_mut().take(LANES).enumerate() {
                 *v = src[l * step + phase];
             }
         }
@@ -154,11 +154,11 @@ impl Prepared {
             for (o, f) in row.iter_mut().zip(src) {
                 *o = f - reference.mean;
             }
-            split(tiling.step, &row, FIELD_BLOCK, out);
+            split(tiling.step, &row, FIELD_BLOCK, 0, out);
             for (c, plane) in [&reference.gx, &reference.gy].into_iter().enumerate() {
                 let at = plane.index(x, py as i32);
                 row[..used].copy_from_slice(&plane.data[at..at + used]);
-                split(tiling.step, &row, FIELD_BLOCK, &mut out[(c + 1) * LANES..]);
+                split(tiling.step, &row, FIELD_BLOCK, (c + 1) * LANES, out);
             }
         }
     }
