@@ -1,7 +1,7 @@
 //! What neighbours say about a point, and whether a group of points can be chance.
 
 use crate::icgn::{Outcome, Solver, significant};
-use crate::point::Status;
+use crate::point::{SolvedBy, Status};
 use crate::points::Points;
 
 /// Groups that confirm each other but cover less than this many subsets may be one chance match:
@@ -11,6 +11,8 @@ const GROUP_SUBSETS: f64 = 9.0;
 const GROUP_FACTOR: f64 = 1.5;
 /// ZNCC that suffices for it in any case.
 const GROUP_CAP: f64 = 0.96;
+/// Subsets' areas that dense points must cover to be no chance.
+const ANCHOR: f64 = 36.0;
 
 /// Judges accepted points by their neighbours: those which are contradicted become
 /// [`Status::Inconsistent`], small groups that may be chance [`Status::LowCorrelation`].
@@ -18,7 +20,8 @@ pub(crate) fn judge(solver: &Solver<'_>, points: &Points, outcomes: &mut [Option
     let tolerance = solver.settings.consistency;
     let contradicted: Vec<usize> = (0..outcomes.len())
         .filter(|&k| {
-            if !accepted(&outcomes[k]) {
+            // a dense point has been held against the field around it
+            if !accepted(&outcomes[k]) || dense(&outcomes[k]) {
                 return false;
             }
             let (mut asked, mut agree) = (0, 0);
@@ -44,6 +47,10 @@ fn accepted(outcome: &Option<Outcome>) -> bool {
     outcome.is_some_and(|o| o.status == Status::Converged)
 }
 
+fn dense(outcome: &Option<Outcome>) -> bool {
+    outcome.is_some_and(|o| o.solver == SolvedBy::Dense)
+}
+
 fn mark(outcomes: &mut [Option<Outcome>], which: &[usize], status: Status) {
     for &k in which {
         if let Some(o) = &mut outcomes[k] {
@@ -60,7 +67,18 @@ fn chance_groups(
     tolerance: f64,
 ) -> Vec<usize> {
     let width = solver.settings.subset as f64;
-    let mut seen = vec![false; outcomes.len()];
+    // Dense points that cover far more than a chance group could stand for each other, and for every
+    // group that joins them.
+    let mut seen: Vec<bool> = outcomes.iter().map(|o| accepted(o) && dense(o)).collect();
+    let step = points.as_grid().map_or(1.0, |g| g.step as f64);
+    let anchored = seen.iter().filter(|&&s| s).count() as f64 * step * step > ANCHOR * width * width;
+    if anchored {
+        if outcomes.iter().all(|o| !accepted(o) || dense(o)) {
+            return Vec::new();
+        }
+    } else {
+        seen.fill(false);
+    }
     let mut chance = Vec::new();
     let mut group: Vec<usize> = Vec::new();
     for start in 0..outcomes.len() {
@@ -73,6 +91,7 @@ fn chance_groups(
         let (mut lo, mut hi) = (points.positions()[start], points.positions()[start]);
         let mut next = 0;
         let mut best = f64::NEG_INFINITY;
+        let mut joins = false;
         while let Some(&k) = group.get(next) {
             next += 1;
             let p = points.positions()[k];
@@ -88,6 +107,7 @@ fn chance_groups(
             }
             for &c in points.neighbours(k) {
                 let c = c as usize;
+                joins |= anchored && dense(&outcomes[c]) && agrees(points, outcomes, k, c, tolerance);
                 if !seen[c] && accepted(&outcomes[c]) && agrees(points, outcomes, k, c, tolerance) {
                     seen[c] = true;
                     group.push(c);
@@ -95,7 +115,7 @@ fn chance_groups(
             }
         }
         let covered = (hi[0] - lo[0] + width) * (hi[1] - lo[1] + width) / (width * width);
-        if covered < GROUP_SUBSETS && best < 0.0 {
+        if !joins && covered < GROUP_SUBSETS && best < 0.0 {
             chance.extend_from_slice(&group);
         }
     }

@@ -319,10 +319,16 @@ const REDUCED: usize = 256;
 fn reduced(image: &Image, factor: usize) -> (Vec<f32>, usize, usize) {
     let (w, h) = (image.width() / factor, image.height() / factor);
     let mut out = vec![0.0f32; w * h];
-    for y in 0..h * factor {
-        let row = &mut out[y / factor * w..][..w];
-        for (o, c) in row.iter_mut().zip(image.row(y).chunks_exact(factor)) {
-            *o += c.iter().sum::<f32>();
+    let mut column_sums = vec![0.0f32; image.width()];
+    for (y, out) in out.chunks_exact_mut(w.max(1)).enumerate() {
+        column_sums.fill(0.0);
+        for row in y * factor..(y + 1) * factor {
+            for (o, g) in column_sums.iter_mut().zip(image.row(row)) {
+                *o += g;
+            }
+        }
+        for (o, c) in out.iter_mut().zip(column_sums.chunks_exact(factor)) {
+            *o = c.iter().sum::<f32>();
         }
     }
     let inv = 1.0 / (factor * factor) as f32;

@@ -28,7 +28,7 @@ pub(crate) struct Solver<'a> {
     pub(crate) target: &'a Target,
     pub(crate) settings: &'a Settings,
     pub(crate) layout: Layout,
-    pub(crate) noise: NoiseGain,
+    pub(crate) noise: &'static NoiseGain,
     pub(crate) level: Level,
     /// Uses the scalar reference implementation instead of the vector kernels.
     pub(crate) scalar: bool,
@@ -83,7 +83,7 @@ impl<'a> Solver<'a> {
             target,
             settings,
             layout: Layout::new(settings.radius()),
-            noise: NoiseGain::new(target.interpolation),
+            noise: NoiseGain::of(target.interpolation),
             level,
             scalar: false,
         }
@@ -164,6 +164,15 @@ impl<'a> Solver<'a> {
         significant(self.settings.significance, independent).min(0.9).max(self.settings.min_zncc)
     }
 
+    /// Whether a ZNCC reaches [`Solver::threshold`].
+    #[inline(always)]
+    fn clears(&self, zncc: f64, independent: f64) -> bool {
+        // tanh x < x saves nearly all points the function
+        let above = zncc >= self.settings.min_zncc;
+        let x2 = self.settings.significance.powi(2) / (independent - 3.0).max(1.0);
+        (above && zncc > 0.0 && zncc * zncc >= x2) || zncc >= self.threshold(independent)
+    }
+
     /// Judges a converged subset by itself: independent speckles and standard uncertainties where it
     /// is accepted.
     #[inline(always)]
@@ -176,9 +185,9 @@ impl<'a> Solver<'a> {
         let independent = self.independent(numbers);
         if !self.inside(x, y, warp, BORDER) {
             Err(Status::OutOfImage)
-        } else if numbers.zncc < self.threshold(independent) {
+        } else if !self.clears(numbers.zncc, independent) {
             Err(Status::LowCorrelation)
-        } else if warp.log_stretch() > self.settings.max_log_stretch {
+        } else if !warp.stretches_less(self.settings.max_log_stretch) {
             Err(Status::Distorted)
         } else {
             Ok((independent, self.sigma(warp, numbers)))

@@ -2,6 +2,7 @@
 
 use crate::settings::Interpolation;
 use crate::shape::Warp;
+use std::sync::OnceLock;
 
 /// Half length of the impulse responses kept; 0.43^40 is far below rounding.
 const REACH: i64 = 40;
@@ -55,7 +56,17 @@ fn cardinal(n: u32) -> Vec<f64> {
 }
 
 impl NoiseGain {
-    pub(crate) fn new(kind: Interpolation) -> Self {
+    /// Properties of an interpolation, worked out once.
+    pub(crate) fn of(kind: Interpolation) -> &'static Self {
+        static CUBIC: OnceLock<NoiseGain> = OnceLock::new();
+        static QUINTIC: OnceLock<NoiseGain> = OnceLock::new();
+        match kind {
+            Interpolation::Cubic => CUBIC.get_or_init(|| Self::new(kind)),
+            Interpolation::Quintic => QUINTIC.get_or_init(|| Self::new(kind)),
+        }
+    }
+
+    fn new(kind: Interpolation) -> Self {
         let n = match kind {
             Interpolation::Cubic => 3,
             Interpolation::Quintic => 5,
@@ -125,8 +136,9 @@ impl NoiseGain {
 /// cos 2πt to 1e-7.
 #[inline(always)]
 fn cosine(t: f64) -> f64 {
-    // sin 2π(¼ − |t|) for |t| ≤ ½ by its Taylor series
-    let s = std::f64::consts::TAU * (0.25 - (t - t.round()).abs());
+    // sin 2π(¼ − |t|) for |t| ≤ ½ by its Taylor series; `round` would be a call on plain x86-64
+    let f = (t - t as i64 as f64).abs();
+    let s = std::f64::consts::TAU * (0.25 - f.min(1.0 - f));
     let q = s * s;
     s * (1.0
         + q * (-1.0 / 6.0

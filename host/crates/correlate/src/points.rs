@@ -270,6 +270,9 @@ impl Points {
     /// Centre pixel of the subset of point k and the offset of the point from it.
     pub(crate) fn centre(&self, k: usize) -> ((i32, i32), [f64; 2]) {
         let [x, y] = self.xy[k];
+        if self.grid.is_some() {
+            return ((x as i32, y as i32), [0.0, 0.0]);
+        }
         let (cx, cy) = (x.round(), y.round());
         ((cx as i32, cy as i32), [x - cx, y - cy])
     }

@@ -280,10 +280,13 @@ impl<'a> Propagation<'a> {
         self.done = self.outcomes.iter().filter(|o| o.is_some()).count();
         let tasks: Vec<Task> = proposals.iter().map(|&(point, warp)| Task { point, warp }).collect();
         self.solve(&tasks);
-        let open = |&k: &usize| {
-            self.accepted(k) && self.points.neighbours(k).iter().any(|&c| self.outcomes[c as usize].is_none())
-        };
-        let front: Vec<usize> = (0..self.points.len()).filter(open).collect();
+        let mut front: Vec<usize> = (0..self.points.len())
+            .filter(|&k| self.outcomes[k].is_none())
+            .flat_map(|k| self.points.neighbours(k).iter().map(|&c| c as usize))
+            .filter(|&c| self.accepted(c))
+            .collect();
+        front.sort_unstable();
+        front.dedup();
         self.finish(front, guess);
     }
 
@@ -325,14 +328,20 @@ impl<'a> Propagation<'a> {
     fn leaving(&mut self) {
         let mut front: Vec<usize> = Vec::new();
         for k in 0..self.points.len() {
+            if self.accepted(k) {
+                continue;
+            }
             let ((x, y), _) = self.points.centre(k);
             if !self.solver.fits(x, y) {
                 let nowhere = Warp::translation(0.0, 0.0);
                 self.outcomes[k] = Some(Outcome::failed(Status::OutOfImage, nowhere));
-            } else if self.accepted(k) {
-                front.push(k);
+            } else if self.outcomes[k].is_none_or(|o| o.status == Status::NotConverged) {
+                let near = self.points.neighbours(k).iter().map(|&c| c as usize);
+                front.extend(near.filter(|&c| self.accepted(c)));
             }
         }
+        front.sort_unstable();
+        front.dedup();
         while !front.is_empty() {
             let mut next = Vec::new();
             for &k in &front {

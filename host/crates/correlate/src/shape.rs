@@ -149,6 +149,15 @@ impl Warp {
         all_finite.then_some(Warp([u, v]))
     }
 
+    /// Whether [`Warp::log_stretch`] is at most `limit`.
+    #[inline(always)]
+    pub(crate) fn stretches_less(&self, limit: f64) -> bool {
+        let [u, v] = &self.0;
+        let largest = u[1].abs().max(u[2].abs()).max(v[1].abs().max(v[2].abs()));
+        // stretches differ from 1 by at most the norm of the gradient, 2 · largest
+        4.0 * largest < limit.min(1.0) || self.log_stretch() <= limit
+    }
+
     /// Largest departure from 1 of the two principal stretches of the deformation gradient at the
     /// centre, as |ln λ|; infinite where the subset is turned inside out.
     pub(crate) fn log_stretch(&self) -> f64 {

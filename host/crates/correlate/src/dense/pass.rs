@@ -48,8 +48,9 @@ struct Rows {
     /// Deformed image, in the order of the pixels and of the tiles.
     g: Vec<f32>,
     g_split: Vec<f32>,
-    /// Field of the equations at the nodes of this row, and its difference to the next node.
-    nodes: [Vec<f32>; 4],
+    /// Displacement and field of the equations at the nodes of this row, and the difference to the
+    /// next node (of the displacement: per pixel).
+    nodes: [[Vec<f32>; 2]; 4],
 }
 
 /// What is common to all tasks of a pass.
@@ -142,9 +143,7 @@ fn run<S: Simd, const N: usize, const N1: usize, const O: usize>(
         if !whole {
             sums.keep_part();
         }
-        sums.close(s, tiling, task, &groups, b, whole);
-        if b >= last {
-            sums.subsets(s, tiling, task, &groups, b);
+        if sums.close(s, tiling, task, &groups, b, whole) {
             let j = b - last;
             let vectors = task.width / LANES;
             let constants = &data.constants[j * vectors * block..(j + 1) * vectors * block];
@@ -167,8 +166,8 @@ impl Rows {
         self.v.resize(wide, 0.0);
         self.g.resize(pixels, 0.0);
         self.g_split.resize(pixels, 0.0);
-        for n in &mut self.nodes {
-            n.resize(task.tiles + 2, 0.0);
+        for n in self.nodes.iter_mut().flatten() {
+            n.resize(task.tiles + LANES, 0.0);
         }
     }
 
@@ -178,36 +177,47 @@ impl Rows {
     fn field<S: Simd>(&mut self, s: S, tiling: &Tiling, task: &Task, nodes: &Nodes, line: usize) {
         let step = tiling.step;
         let down = line + tiling.lead();
-        let t = (down % step) as f32 / step as f32;
+        let t = V::splat(s, (down % step) as f32 / step as f32);
         let at = (task.row + down / step) * nodes.stride + task.column;
-        let n = task.tiles + 2;
-        let (upper, lower) = (at..at + n + 1, at + nodes.stride..at + nodes.stride + n + 1);
+        let n = task.tiles + LANES;
+        let (upper, lower) = (at..at + n, at + nodes.stride..at + nodes.stride + n);
         let lanes = V::from_fn(s, |l| l as f32);
-        let inv = 1.0 / step as f32;
-        for (field, out) in [(&nodes.u, &mut self.u), (&nodes.v, &mut self.v)] {
-            let (a, b) = (&field[upper.clone()], &field[lower.clone()]);
-            let mut value = (b[0] - a[0]).mul_add(t, a[0]);
-            for i in 0..n - 1 {
-                let next = (b[i + 1] - a[i + 1]).mul_add(t, a[i + 1]);
-                let (start, slope) = (V::splat(s, value), V::splat(s, (next - value) * inv));
+        let inv = V::splat(s, 1.0 / step as f32);
+        let fields = [
+            (&nodes.u, Some(&mut self.u)),
+            (&nodes.v, Some(&mut self.v)),
+            (&nodes.cu, None),
+            (&nodes.cv, None),
+        ];
+        for ((field, pixels), [value, difference]) in fields.into_iter().zip(&mut self.nodes) {
+            let rows = field[upper.clone()].chunks_exact(LANES).zip(field[lower.clone()].chunks_exact(LANES));
+            for ((a, b), o) in rows.zip(value.chunks_exact_mut(LANES)) {
+                let a = V::from_slice(s, a);
+                (V::from_slice(s, b) - a).mul_add(t, a).store_slice(o);
+            }
+            let next = value[1..n].chunks_exact(LANES);
+            for ((a, b), o) in value.chunks_exact(LANES).zip(next).zip(difference.chunks_exact_mut(LANES)) {
+                (V::from_slice(s, b) - V::from_slice(s, a)).store_slice(o);
+            }
+            let Some(pixels) = pixels else {
+                continue;
+            };
+            for c in difference.chunks_exact_mut(LANES) {
+                (V::from_slice(s, c) * inv).store_slice(c);
+            }
+            let mut o = 0;
+            for (value, slope) in value.iter().zip(difference.iter()).take(task.tiles + 1) {
+                let (start, slope) = (V::splat(s, *value), V::splat(s, *slope));
                 let mut k = 0;
-                while k < step {
-                    let o = i * step + k;
+                loop {
                     let x = lanes + V::splat(s, k as f32);
-                    slope.mul_add(x, start).store_slice(&mut out[o..o + LANES]);
+                    slope.mul_add(x, start).store_slice(&mut pixels[o + k..o + k + LANES]);
                     k += LANES;
+                    if k >= step {
+                        break;
+                    }
                 }
-                value = next;
-            }
-        }
-        let [nu, du, nv, dv] = &mut self.nodes;
-        for (field, out, difference) in [(&nodes.cu, nu, du), (&nodes.cv, nv, dv)] {
-            let (a, b) = (&field[upper.clone()], &field[lower.clone()]);
-            for i in 0..n {
-                out[i] = (b[i] - a[i]).mul_add(t, a[i]);
-            }
-            for i in 0..n - 1 {
-                difference[i] = out[i + 1] - out[i];
+                o += step;
             }
         }
     }
@@ -216,7 +226,7 @@ impl Rows {
 struct Input<'a> {
     fields: &'a [f32],
     g: &'a [f32],
-    nodes: &'a [Vec<f32>; 4],
+    nodes: &'a [[Vec<f32>; 2]; 4],
     phases: &'a [(usize, f32)],
     x: &'a [[f32; DEGREES]],
     rem: usize,
@@ -236,7 +246,7 @@ fn accumulate<S: Simd, const O: usize>(
     let half = tiles.len() / 2;
     let (whole, part) = tiles.split_at_mut(half);
     let rem = input.rem;
-    let [nu, du, nv, dv] = input.nodes;
+    let [_, _, [nu, du], [nv, dv]] = input.nodes;
     let blocks = input.fields.chunks_exact(step * FIELD_BLOCK).zip(input.g.chunks_exact(step * LANES));
     for (group, (block, g)) in blocks.enumerate() {
         let k = group * LANES;

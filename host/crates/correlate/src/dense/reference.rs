@@ -267,9 +267,7 @@ fn factor<S: Simd, const O: usize, const O2: usize>(
         if !whole {
             buffers.keep_part();
         }
-        buffers.close(s, tiling, task, &groups, b, whole);
-        if b >= last {
-            buffers.subsets(s, tiling, task, &groups, b);
+        if buffers.close(s, tiling, task, &groups, b, whole) {
             let row = (b - last) * task.width / LANES * block;
             let out = &mut data.constants[row..row + task.width / LANES * block];
             for (group, out) in out.chunks_exact_mut(block).enumerate() {

@@ -24,29 +24,28 @@ pub(crate) struct SumBuffers {
     pub(crate) tiles: Vec<f32>,
     /// The same after the first `rem` rows of the tiles.
     part: Vec<f32>,
-    /// Rows of tiles summed along x, the last ones needed.
+    /// The last q rows of tiles summed along x, and the partial row after them.
     ring: Vec<f32>,
-    /// The same for the partial row.
-    ring_part: Vec<f32>,
     /// Sums of one row of subsets.
     pub(crate) subsets: Vec<f32>,
-    shifts: Vec<[[f32; DEGREES]; DEGREES]>,
+    shifts: Vec<Shift>,
+    /// The shifts in the order of the ring.
+    turned: Vec<Shift>,
 }
+
+type Shift = [[f32; DEGREES]; DEGREES];
 
 impl SumBuffers {
     /// Makes room for `planes` moments.
     pub(crate) fn prepare(&mut self, tiling: &Tiling, task: &Task, planes: usize) {
-        let resize = |v: &mut Vec<f32>, n: usize| {
-            v.clear();
-            v.resize(n, 0.0);
-        };
-        resize(&mut self.tiles, 2 * planes * task.tiles);
-        resize(&mut self.part, 2 * planes * task.tiles);
-        resize(&mut self.ring, (tiling.last() + 1) * planes * task.width);
-        resize(&mut self.ring_part, planes * task.width);
-        resize(&mut self.subsets, planes * task.width);
+        let (q, rem) = tiling.whole();
+        self.tiles.resize(2 * planes * task.tiles, 0.0);
+        self.part.resize(2 * planes * task.tiles, 0.0);
+        self.ring.resize((q + usize::from(rem > 0)) * planes * task.width, 0.0);
+        self.subsets.resize(planes * task.width, 0.0);
         self.shifts.clear();
         self.shifts.extend((0..=tiling.last()).map(|m| tiling.shift(m)));
+        self.turned.clone_from(&self.shifts);
     }
 
     /// Begins a row of tiles.
@@ -59,7 +58,8 @@ impl SumBuffers {
         self.part.copy_from_slice(&self.tiles);
     }
 
-    /// Closes row of tiles `b`; `whole` unless only its first rows were summed.
+    /// Closes row of tiles `b`, of which only the first rows were summed unless `whole`; whether the
+    /// sums of a row of subsets are there.
     #[inline(always)]
     pub(crate) fn close<S: Simd>(
         &mut self,
@@ -69,44 +69,50 @@ impl SumBuffers {
         groups: &[Group],
         b: usize,
         whole: bool,
-    ) {
-        let slot = self.ring.len() / (tiling.last() + 1);
+    ) -> bool {
+        let (q, rem) = tiling.whole();
+        let slot = self.subsets.len();
+        let full = b >= tiling.last();
+        if rem > 0 && full {
+            let out = &mut self.ring[q * slot..];
+            along_x(s, tiling, task, groups, &self.shifts, &self.part, out);
+            self.down(s, tiling, task, groups, b);
+        }
         if whole {
-            let at = b % (tiling.last() + 1) * slot;
-            let out = &mut self.ring[at..at + slot];
-            along_x(s, tiling, task, groups, &self.shifts, &self.tiles, out);
+            let at = b % q * slot;
+            along_x(s, tiling, task, groups, &self.shifts, &self.tiles, &mut self.ring[at..at + slot]);
         }
-        if tiling.whole().1 > 0 && b >= tiling.last() {
-            along_x(s, tiling, task, groups, &self.shifts, &self.part, &mut self.ring_part);
+        if rem == 0 && full {
+            self.down(s, tiling, task, groups, b);
         }
+        full
     }
 
     /// Sums of the subsets whose last row of tiles is `b`.
     #[inline(always)]
-    pub(crate) fn subsets<S: Simd>(&mut self, s: S, tiling: &Tiling, task: &Task, groups: &[Group], b: usize) {
-        let (q, rem) = tiling.whole();
-        let slots = tiling.last() + 1;
-        let slot = self.ring.len() / slots;
+    fn down<S: Simd>(&mut self, s: S, tiling: &Tiling, task: &Task, groups: &[Group], b: usize) {
+        let q = tiling.whole().0;
         let first = b - tiling.last();
-        let w = task.width;
+        for m in 0..q {
+            self.turned[(first + m) % q] = self.shifts[m];
+        }
+        let (w, slot) = (task.width, self.subsets.len());
         let mut plane = 0;
         for g in groups {
             for _ in 0..g.count {
                 for i in 0..=g.degree {
-                    let at = std::array::from_fn(|e| (plane + monomial(i, e)) * w);
-                    let row = |m: usize| {
-                        if m < q { &self.ring[(first + m) % slots * slot..][..slot] } else { &self.ring_part[..] }
-                    };
-                    let out = &mut self.subsets;
-                    let tiles = q + usize::from(rem > 0);
+                    let at: [usize; DEGREES] = std::array::from_fn(|e| (plane + monomial(i, e)) * w);
                     macro_rules! line {
                         ($n:literal) => {
                             for k in (0..w).step_by(LANES) {
                                 let mut acc = [V::splat(s, 0.0); DEGREES];
-                                for m in 0..tiles {
-                                    add::<S, $n>(s, &mut acc, &self.shifts[m], row(m), &at, k);
+                                for (row, c) in self.ring.chunks_exact(slot).zip(&self.turned) {
+                                    for e in 0..=$n {
+                                        let t = V::from_slice(s, &row[at[e] + k..at[e] + k + LANES]);
+                                        add::<S, $n>(s, &mut acc, c, e, t);
+                                    }
                                 }
-                                store::<S, $n>(&acc, out, &at, k);
+                                store::<S, $n>(&acc, &mut self.subsets, &at, k);
                             }
                         };
                     }
@@ -124,23 +130,12 @@ impl SumBuffers {
     }
 }
 
-/// Adds one tile's moments of degree 0..=N, carried to the subset's centre.
+/// Adds the moment of degree `e` of one tile to those of degree e..=N of the subset.
 #[inline(always)]
-fn add<S: Simd, const N: usize>(
-    s: S,
-    acc: &mut [V<S>; DEGREES],
-    c: &[[f32; DEGREES]; DEGREES],
-    planes: &[f32],
-    at: &[usize; DEGREES],
-    k: usize,
-) {
-    for e in 0..=N {
-        let o = at[e] + k;
-        let t = V::from_slice(s, &planes[o..o + LANES]);
-        acc[e] += t;
-        for i in e + 1..=N {
-            acc[i] = V::splat(s, c[i][e]).mul_add(t, acc[i]);
-        }
+fn add<S: Simd, const N: usize>(s: S, acc: &mut [V<S>; DEGREES], c: &Shift, e: usize, t: V<S>) {
+    acc[e] += t;
+    for i in e + 1..=N {
+        acc[i] = V::splat(s, c[i][e]).mul_add(t, acc[i]);
     }
 }
 
@@ -158,7 +153,7 @@ fn along_x<S: Simd>(
     tiling: &Tiling,
     task: &Task,
     groups: &[Group],
-    shifts: &[[[f32; DEGREES]; DEGREES]],
+    shifts: &[Shift],
     tiles: &[f32],
     out: &mut [f32],
 ) {
@@ -168,17 +163,21 @@ fn along_x<S: Simd>(
     for g in groups {
         for _ in 0..g.count {
             for j in 0..=g.degree {
-                let from = std::array::from_fn(|e| (plane + monomial(e, j)) * task.tiles);
-                let to = std::array::from_fn(|e| (plane + monomial(e, j)) * task.width);
+                let from: [usize; DEGREES] = std::array::from_fn(|e| (plane + monomial(e, j)) * task.tiles);
+                let to: [usize; DEGREES] = std::array::from_fn(|e| (plane + monomial(e, j)) * task.width);
                 macro_rules! line {
                     ($n:literal) => {
                         for k in (0..task.width).step_by(LANES) {
                             let mut acc = [V::splat(s, 0.0); DEGREES];
-                            for m in 0..q {
-                                add::<S, $n>(s, &mut acc, &shifts[m], whole, &from, k + m);
-                            }
-                            if rem > 0 {
-                                add::<S, $n>(s, &mut acc, &shifts[q], part, &from, k + q);
+                            for e in 0..=$n {
+                                let row = &whole[from[e] + k..from[e] + k + q - 1 + LANES];
+                                for (t, c) in row.windows(LANES).zip(shifts) {
+                                    add::<S, $n>(s, &mut acc, c, e, V::from_slice(s, t));
+                                }
+                                if rem > 0 {
+                                    let t = &part[from[e] + k + q..from[e] + k + q + LANES];
+                                    add::<S, $n>(s, &mut acc, &shifts[q], e, V::from_slice(s, t));
+                                }
                             }
                             store::<S, $n>(&acc, out, &to, k);
                         }
