@@ -34,7 +34,7 @@ const LINEAR: f32 = 0.1;
 /// Distance up to which a point's result is good enough to carry the field for the next pass.
 const CARRIES: f32 = 2.0;
 /// Distance between sparse points, in subset widths.
-const SPARSE: f64 = 1.2;
+const SPARSE: f64 = 1.6;
 /// Whole tiles in a subset from which sharing sums pays.
 const OVERLAP: usize = 2;
 

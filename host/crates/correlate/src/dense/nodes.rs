@@ -53,7 +53,7 @@ impl Affine {
 impl Nodes {
     fn resize(&mut self, tiling: &Tiling) {
         let e = tiling.margin();
-        self.stride = tiling.columns.next_multiple_of(8) + 2 * e + 24;
+        self.stride = tiling.columns.next_multiple_of(8) + 2 * e + 32;
         let n = self.stride * (tiling.rows + 2 * e + 1);
         for v in [&mut self.u, &mut self.v, &mut self.cu, &mut self.cv] {
             v.resize(n, 0.0);

@@ -10,7 +10,7 @@ use super::nodes::Nodes;
 use super::reference::{self, FIELD_BLOCK, Prepared, corner};
 use super::sums::{Group, SumBuffers, flush};
 use super::tiling::{DEGREES, LANES, Task, Tiling, moments};
-use super::warp::warp_row;
+use super::warp::{RowField, Spread, warp_row};
 use crate::plane::Plane;
 use crate::sampler::V;
 use crate::settings::Criterion;
@@ -42,9 +42,6 @@ pub(crate) struct Buffers {
 /// One row of pixels.
 #[derive(Default)]
 struct Rows {
-    /// Displacement at each pixel.
-    u: Vec<f32>,
-    v: Vec<f32>,
     /// Deformed image, in the order of the pixels and of the tiles.
     g: Vec<f32>,
     g_split: Vec<f32>,
@@ -107,11 +104,15 @@ fn run<S: Simd, const N: usize, const N1: usize, const O: usize>(
     sums.prepare(tiling, task, planes);
     rows.prepare(tiling, task);
     let powers: Vec<[f32; DEGREES]> = (0..tiling.step).map(|p| tiling.powers(p)).collect();
-    // per phase: the node left of it, counted from the tile's, and the way from there to the next
-    let lead = tiling.lead();
-    let phases: Vec<(usize, f32)> = (0..tiling.step)
-        .map(|p| ((p + lead) / tiling.step, ((p + lead) % tiling.step) as f32 / tiling.step as f32))
+    let (step, lead) = (tiling.step, tiling.lead());
+    let phases: Vec<Phase> = (0..step)
+        .map(|p| Phase {
+            node: (p + lead) / step,
+            t: ((p + lead) % step) as f32 / step as f32,
+            x: powers[p],
+        })
         .collect();
+    let spread = Spread::new(step, lead);
     let rem = tiling.whole().1;
     let row_floats = task.tiles * tiling.step * 3;
     let last = tiling.last();
@@ -130,11 +131,13 @@ fn run<S: Simd, const N: usize, const N1: usize, const O: usize>(
             }
             if let Some(f) = fields.next() {
                 rows.field(s, tiling, task, pass.nodes, line);
-                let Rows { u, v, g, g_split, nodes } = &mut *rows;
-                warp_row::<S, N, N1>(s, pass.plane, x, y + line as i32, &u[lead..], &v[lead..], g);
+                let Rows { g, g_split, nodes } = &mut *rows;
+                let [[u, su], [v, sv], ..] = &*nodes;
+                let field = RowField { u, su, v, sv, spread: &spread };
+                warp_row::<S, N, N1>(s, pass.plane, x, y + line as i32, &field, g);
                 reference::split(tiling.step, g, LANES, 0, g_split);
                 let stride = task.tiles;
-                let input = Input { fields: f, g: g_split, nodes, phases: &phases, x: &powers, rem };
+                let input = Input { fields: f, g: g_split, nodes, phases: &phases, rem };
                 accumulate::<S, O>(s, &input, &powers[summed], &mut sums.tiles, stride);
             }
             line += 1;
@@ -160,75 +163,54 @@ fn run<S: Simd, const N: usize, const N1: usize, const O: usize>(
 impl Rows {
     fn prepare(&mut self, tiling: &Tiling, task: &Task) {
         let pixels = task.tiles * tiling.step;
-        // stores of whole vectors run over the last node
-        let wide = pixels + 2 * tiling.step + 2 * LANES;
-        self.u.resize(wide, 0.0);
-        self.v.resize(wide, 0.0);
         self.g.resize(pixels, 0.0);
         self.g_split.resize(pixels, 0.0);
         for n in self.nodes.iter_mut().flatten() {
-            n.resize(task.tiles + LANES, 0.0);
+            n.resize(task.tiles + 2 * LANES, 0.0);
         }
     }
 
-    /// The field along row `line` of the task's pixels: at each pixel, and at the nodes for the
-    /// equations.
+    /// The field at the nodes along row `line` of the task's pixels.
     #[inline(always)]
     fn field<S: Simd>(&mut self, s: S, tiling: &Tiling, task: &Task, nodes: &Nodes, line: usize) {
         let step = tiling.step;
         let down = line + tiling.lead();
         let t = V::splat(s, (down % step) as f32 / step as f32);
         let at = (task.row + down / step) * nodes.stride + task.column;
-        let n = task.tiles + LANES;
+        let n = task.tiles + 2 * LANES;
         let (upper, lower) = (at..at + n, at + nodes.stride..at + nodes.stride + n);
-        let lanes = V::from_fn(s, |l| l as f32);
-        let inv = V::splat(s, 1.0 / step as f32);
-        let fields = [
-            (&nodes.u, Some(&mut self.u)),
-            (&nodes.v, Some(&mut self.v)),
-            (&nodes.cu, None),
-            (&nodes.cv, None),
-        ];
-        for ((field, pixels), [value, difference]) in fields.into_iter().zip(&mut self.nodes) {
+        let per_pixel = V::splat(s, 1.0 / step as f32);
+        let one = V::splat(s, 1.0);
+        let fields = [(&nodes.u, per_pixel), (&nodes.v, per_pixel), (&nodes.cu, one), (&nodes.cv, one)];
+        for ((field, scale), [value, difference]) in fields.into_iter().zip(&mut self.nodes) {
             let rows = field[upper.clone()].chunks_exact(LANES).zip(field[lower.clone()].chunks_exact(LANES));
             for ((a, b), o) in rows.zip(value.chunks_exact_mut(LANES)) {
                 let a = V::from_slice(s, a);
                 (V::from_slice(s, b) - a).mul_add(t, a).store_slice(o);
             }
-            let next = value[1..n].chunks_exact(LANES);
+            let next = value[1..].chunks_exact(LANES);
             for ((a, b), o) in value.chunks_exact(LANES).zip(next).zip(difference.chunks_exact_mut(LANES)) {
-                (V::from_slice(s, b) - V::from_slice(s, a)).store_slice(o);
-            }
-            let Some(pixels) = pixels else {
-                continue;
-            };
-            for c in difference.chunks_exact_mut(LANES) {
-                (V::from_slice(s, c) * inv).store_slice(c);
-            }
-            let mut o = 0;
-            for (value, slope) in value.iter().zip(difference.iter()).take(task.tiles + 1) {
-                let (start, slope) = (V::splat(s, *value), V::splat(s, *slope));
-                let mut k = 0;
-                loop {
-                    let x = lanes + V::splat(s, k as f32);
-                    slope.mul_add(x, start).store_slice(&mut pixels[o + k..o + k + LANES]);
-                    k += LANES;
-                    if k >= step {
-                        break;
-                    }
-                }
-                o += step;
+                ((V::from_slice(s, b) - V::from_slice(s, a)) * scale).store_slice(o);
             }
         }
     }
+}
+
+/// One phase of the tiles.
+struct Phase {
+    /// Node left of it, counted from the tile's own: 0 or 1.
+    node: usize,
+    /// Way from there to the next node.
+    t: f32,
+    /// Powers of the tile-local coordinate.
+    x: [f32; DEGREES],
 }
 
 struct Input<'a> {
     fields: &'a [f32],
     g: &'a [f32],
     nodes: &'a [[Vec<f32>; 2]; 4],
-    phases: &'a [(usize, f32)],
-    x: &'a [[f32; DEGREES]],
+    phases: &'a [Phase],
     rem: usize,
 }
 
@@ -250,56 +232,65 @@ fn accumulate<S: Simd, const O: usize>(
     let blocks = input.fields.chunks_exact(step * FIELD_BLOCK).zip(input.g.chunks_exact(step * LANES));
     for (group, (block, g)) in blocks.enumerate() {
         let k = group * LANES;
-        let window = k..k + LANES + 2;
-        let (nu, du) = (&nu[window.clone()], &du[window.clone()]);
-        let (nv, dv) = (&nv[window.clone()], &dv[window]);
+        // the field at the tiles' own nodes and at the next ones
+        let mut nodes = [[zero; 4]; 2];
+        for (i, n) in nodes.iter_mut().enumerate() {
+            let window = k + i..k + i + LANES;
+            *n = [
+                V::from_slice(s, &nu[window.clone()]),
+                V::from_slice(s, &du[window.clone()]),
+                V::from_slice(s, &nv[window.clone()]),
+                V::from_slice(s, &dv[window]),
+            ];
+        }
         let mut a = [[zero; O_MAX]; 4];
         let mut q = [zero; 4];
+        macro_rules! pixels {
+            ($f:expr, $g:expr, $phases:expr) => {
+                for ((f, g), phase) in $f.chunks_exact(FIELD_BLOCK).zip($g.chunks_exact(LANES)).zip($phases) {
+                    let fv = V::from_slice(s, &f[..LANES]);
+                    let xv = V::from_slice(s, &f[LANES..2 * LANES]);
+                    let yv = V::from_slice(s, &f[2 * LANES..]);
+                    let t = V::splat(s, phase.t);
+                    let [nu, du, nv, dv] = nodes[phase.node & 1];
+                    let h = xv.mul_add(t.mul_add(du, nu), yv * t.mul_add(dv, nv));
+                    let r = fv - V::from_slice(s, g);
+                    let products = [xv * r, yv * r, xv * h, yv * h];
+                    for c in 0..4 {
+                        a[c][0] += products[c];
+                        for i in 1..=O {
+                            a[c][i] = products[c].mul_add(V::splat(s, phase.x[i]), a[c][i]);
+                        }
+                    }
+                    q[0] += r;
+                    q[1] += h;
+                    q[2] = r.mul_add(r, q[2]);
+                    q[3] = fv.mul_add(r, q[3]);
+                }
+            };
+        }
+        macro_rules! add_to {
+            ($tiles:expr) => {{
+                let mut planes = &mut *$tiles;
+                for c in &a {
+                    flush::<S, O>(s, c, y, planes, stride, k);
+                    planes = &mut planes[moments(O) * stride..];
+                }
+                for c in &q {
+                    flush::<S, 0>(s, std::slice::from_ref(c), y, planes, stride, k);
+                    planes = &mut planes[stride..];
+                }
+            }};
+        }
         let (f0, f1) = block.split_at(rem * FIELD_BLOCK);
         let (g0, g1) = g.split_at(rem * LANES);
         let (p0, p1) = input.phases.split_at(rem);
-        let (x0, x1) = input.x.split_at(rem);
-        for (is_part, f, g, phases, x) in [(true, f0, g0, p0, x0), (false, f1, g1, p1, x1)] {
-            let pixels = f.chunks_exact(FIELD_BLOCK).zip(g.chunks_exact(LANES)).zip(phases).zip(x);
-            for (((f, g), &(node, t)), x) in pixels {
-                let fv = V::from_slice(s, &f[..LANES]);
-                let xv = V::from_slice(s, &f[LANES..2 * LANES]);
-                let yv = V::from_slice(s, &f[2 * LANES..]);
-                let t = V::splat(s, t);
-                macro_rules! at {
-                    ($n:expr) => {
-                        V::from_slice(s, &$n[node..node + LANES])
-                    };
-                }
-                let u = t.mul_add(at!(du), at!(nu));
-                let v = t.mul_add(at!(dv), at!(nv));
-                let h = xv.mul_add(u, yv * v);
-                let r = fv - V::from_slice(s, g);
-                let products = [xv * r, yv * r, xv * h, yv * h];
-                for c in 0..4 {
-                    a[c][0] += products[c];
-                    for i in 1..=O {
-                        a[c][i] = products[c].mul_add(V::splat(s, x[i]), a[c][i]);
-                    }
-                }
-                q[0] += r;
-                q[1] += h;
-                q[2] = r.mul_add(r, q[2]);
-                q[3] = fv.mul_add(r, q[3]);
-            }
-            if is_part && rem == 0 {
-                continue;
-            }
-            let mut planes = if is_part { &mut *part } else { &mut *whole };
-            for c in &a {
-                flush::<S, O>(s, c, y, planes, stride, k);
-                planes = &mut planes[moments(O) * stride..];
-            }
-            for c in &q {
-                flush::<S, 0>(s, std::slice::from_ref(c), y, planes, stride, k);
-                planes = &mut planes[stride..];
-            }
+        if rem > 0 {
+            pixels!(f0, g0, p0);
+            add_to!(part);
         }
+        pixels!(f1, g1, p1);
+        add_to!(whole);
     }
 }
 

@@ -4,6 +4,28 @@ use super::tiling::{DEGREES, LANES, Task, Tiling, moments, monomial};
 use crate::sampler::V;
 use fearless_simd::prelude::*;
 
+/// Calls `$batch!(degree, planes)` for all lines of all groups.
+macro_rules! each_batch {
+    ($groups:expr, |$i:ident, $e:ident| $moment:expr, $batch:ident) => {{
+        let mut plane = 0;
+        for g in $groups {
+            let step = moments(g.degree);
+            for $i in 0..=g.degree {
+                for first in (0..g.count).step_by(BATCH) {
+                    match g.degree - $i {
+                        0 => $batch!(0, planes(plane, step, first, g.count, |$e| $moment)),
+                        1 => $batch!(1, planes(plane, step, first, g.count, |$e| $moment)),
+                        2 => $batch!(2, planes(plane, step, first, g.count, |$e| $moment)),
+                        3 => $batch!(3, planes(plane, step, first, g.count, |$e| $moment)),
+                        _ => $batch!(4, planes(plane, step, first, g.count, |$e| $moment)),
+                    }
+                }
+            }
+            plane += g.planes();
+        }
+    }};
+}
+
 /// `count` quantities whose moments up to `degree` are summed.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Group {
@@ -97,37 +119,53 @@ impl SumBuffers {
             self.turned[(first + m) % q] = self.shifts[m];
         }
         let (w, slot) = (task.width, self.subsets.len());
-        let mut plane = 0;
-        for g in groups {
-            for _ in 0..g.count {
-                for i in 0..=g.degree {
-                    let at: [usize; DEGREES] = std::array::from_fn(|e| (plane + monomial(i, e)) * w);
-                    macro_rules! line {
-                        ($n:literal) => {
-                            for k in (0..w).step_by(LANES) {
-                                let mut acc = [V::splat(s, 0.0); DEGREES];
-                                for (row, c) in self.ring.chunks_exact(slot).zip(&self.turned) {
-                                    for e in 0..=$n {
-                                        let t = V::from_slice(s, &row[at[e] + k..at[e] + k + LANES]);
-                                        add::<S, $n>(s, &mut acc, c, e, t);
-                                    }
-                                }
-                                store::<S, $n>(&acc, &mut self.subsets, &at, k);
+        let Self { ring, subsets, turned, .. } = self;
+        // a batch of lines shares the loop over the tiles
+        macro_rules! batch {
+            ($n:literal, $planes:expr) => {{
+                let planes: [[usize; BATCH]; $n + 1] = $planes;
+                for k in (0..w).step_by(LANES) {
+                    let mut acc = [[V::splat(s, 0.0); DEGREES]; BATCH];
+                    for (row, c) in ring.chunks_exact(slot).zip(turned.iter()) {
+                        for e in 0..=$n {
+                            for l in 0..BATCH {
+                                let o = planes[e][l] * w + k;
+                                add::<S, $n>(s, &mut acc[l], c, e, V::from_slice(s, &row[o..o + LANES]));
                             }
-                        };
+                        }
                     }
-                    match g.degree - i {
-                        0 => line!(0),
-                        1 => line!(1),
-                        2 => line!(2),
-                        3 => line!(3),
-                        _ => line!(4),
+                    for e in 0..=$n {
+                        for l in 0..BATCH {
+                            let o = planes[e][l] * w + k;
+                            acc[l][e].store_slice(&mut subsets[o..o + LANES]);
+                        }
                     }
                 }
-                plane += moments(g.degree);
-            }
+            }};
+        }
+        each_batch!(groups, |i, e| monomial(i, e), batch);
+    }
+}
+
+/// Lines of moments that are summed together.
+const BATCH: usize = 4;
+
+/// Planes of `BATCH` lines from quantity `first` on; lines beyond `count` repeat the last one.
+#[inline(always)]
+fn planes<const N: usize>(
+    plane: usize,
+    step: usize,
+    first: usize,
+    count: usize,
+    moment: impl Fn(usize) -> usize,
+) -> [[usize; BATCH]; N] {
+    let mut p = [[0; BATCH]; N];
+    for (e, row) in p.iter_mut().enumerate() {
+        for (l, plane_of) in row.iter_mut().enumerate() {
+            *plane_of = plane + (first + l).min(count - 1) * step + moment(e);
         }
     }
+    p
 }
 
 /// Adds the moment of degree `e` of one tile to those of degree e..=N of the subset.
@@ -136,14 +174,6 @@ fn add<S: Simd, const N: usize>(s: S, acc: &mut [V<S>; DEGREES], c: &Shift, e: u
     acc[e] += t;
     for i in e + 1..=N {
         acc[i] = V::splat(s, c[i][e]).mul_add(t, acc[i]);
-    }
-}
-
-#[inline(always)]
-fn store<S: Simd, const N: usize>(acc: &[V<S>; DEGREES], out: &mut [f32], at: &[usize; DEGREES], k: usize) {
-    for e in 0..=N {
-        let o = at[e] + k;
-        acc[e].store_slice(&mut out[o..o + LANES]);
     }
 }
 
@@ -159,41 +189,39 @@ fn along_x<S: Simd>(
 ) {
     let (q, rem) = tiling.whole();
     let (whole, part) = tiles.split_at(tiles.len() / 2);
-    let mut plane = 0;
-    for g in groups {
-        for _ in 0..g.count {
-            for j in 0..=g.degree {
-                let from: [usize; DEGREES] = std::array::from_fn(|e| (plane + monomial(e, j)) * task.tiles);
-                let to: [usize; DEGREES] = std::array::from_fn(|e| (plane + monomial(e, j)) * task.width);
-                macro_rules! line {
-                    ($n:literal) => {
-                        for k in (0..task.width).step_by(LANES) {
-                            let mut acc = [V::splat(s, 0.0); DEGREES];
-                            for e in 0..=$n {
-                                let row = &whole[from[e] + k..from[e] + k + q - 1 + LANES];
-                                for (t, c) in row.windows(LANES).zip(shifts) {
-                                    add::<S, $n>(s, &mut acc, c, e, V::from_slice(s, t));
-                                }
-                                if rem > 0 {
-                                    let t = &part[from[e] + k + q..from[e] + k + q + LANES];
-                                    add::<S, $n>(s, &mut acc, &shifts[q], e, V::from_slice(s, t));
-                                }
-                            }
-                            store::<S, $n>(&acc, out, &to, k);
+    let (width, stride) = (task.width, task.tiles);
+    macro_rules! batch {
+        ($n:literal, $planes:expr) => {{
+            let planes: [[usize; BATCH]; $n + 1] = $planes;
+            for k in (0..width).step_by(LANES) {
+                let mut acc = [[V::splat(s, 0.0); DEGREES]; BATCH];
+                // all windows have one length: one comparison serves the loads of a tile
+                let length = q - 1 + LANES;
+                for e in 0..=$n {
+                    let rows: [&[f32]; BATCH] = planes[e].map(|p| &whole[p * stride + k..][..length]);
+                    for (m, c) in shifts[..q].iter().enumerate() {
+                        for l in 0..BATCH {
+                            add::<S, $n>(s, &mut acc[l], c, e, V::from_slice(s, &rows[l][m..m + LANES]));
                         }
-                    };
+                    }
+                    if rem > 0 {
+                        for l in 0..BATCH {
+                            let o = planes[e][l] * stride + k + q;
+                            let t = V::from_slice(s, &part[o..o + LANES]);
+                            add::<S, $n>(s, &mut acc[l], &shifts[q], e, t);
+                        }
+                    }
                 }
-                match g.degree - j {
-                    0 => line!(0),
-                    1 => line!(1),
-                    2 => line!(2),
-                    3 => line!(3),
-                    _ => line!(4),
+                for e in 0..=$n {
+                    for l in 0..BATCH {
+                        let o = planes[e][l] * width + k;
+                        acc[l][e].store_slice(&mut out[o..o + LANES]);
+                    }
                 }
             }
-            plane += moments(g.degree);
-        }
+        }};
     }
+    each_batch!(groups, |j, e| monomial(e, j), batch);
 }
 
 /// Adds the sums over one row of pixels, x-powers in `acc`, to the planes of one quantity.

@@ -3,33 +3,79 @@
 use crate::plane::Plane;
 use crate::sampler::{V, convolve, sample_lanes, shifted, weights};
 use crate::subset::LANES;
-use fearless_simd::prelude::*;
+use fearless_simd::{prelude::*, u8x32};
 
-/// Interpolates the pixels (x + k, y), displaced by (u[k], v[k]), into `out`, whose length is a
-/// multiple of eight. Loads are contiguous wherever the integer part of the displacement takes at
-/// most two values over eight pixels; elsewhere each pixel is read by itself. What lies outside the
-/// padded plane is arbitrary but finite.
+/// How eight pixels in a row lie between the nodes, by the phase of the first one.
+pub(crate) struct Spread {
+    step: usize,
+    lead: usize,
+    /// Node of each pixel counted from the first one's, as byte indices into a vector; and the pixel's
+    /// distance from its node.
+    lanes: Vec<([u8; 4 * LANES], [f32; LANES])>,
+}
+
+impl Spread {
+    /// Nodes every `step` pixels, the first `lead` pixels before the row.
+    pub(crate) fn new(step: usize, lead: usize) -> Self {
+        let lanes = (0..step)
+            .map(|t| {
+                let index = std::array::from_fn(|b| ((t + b / 4) / step * 4 + b % 4) as u8);
+                (index, std::array::from_fn(|l| ((t + l) % step) as f32))
+            })
+            .collect();
+        Self { step, lead, lanes }
+    }
+}
+
+/// A displacement field along a row: values at the nodes and slopes per pixel from there to the next.
+pub(crate) struct RowField<'a> {
+    pub(crate) u: &'a [f32],
+    pub(crate) su: &'a [f32],
+    pub(crate) v: &'a [f32],
+    pub(crate) sv: &'a [f32],
+    pub(crate) spread: &'a Spread,
+}
+
+/// Interpolates the pixels (x + k, y), displaced by the field, into `out`, whose length is a multiple
+/// of eight. Loads are contiguous wherever the integer part of the displacement takes at most two
+/// values over eight pixels; elsewhere each pixel is read by itself. What lies outside the padded
+/// plane is arbitrary but finite.
 #[inline(always)]
 pub(crate) fn warp_row<S: Simd, const N: usize, const N1: usize>(
     s: S,
     plane: &Plane,
     x: i32,
     y: i32,
-    u: &[f32],
-    v: &[f32],
+    field: &RowField<'_>,
     out: &mut [f32],
 ) {
     let zero = V::splat(s, 0.0);
     let one = V::splat(s, 1.0);
     let centre = V::splat(s, 0.5);
     let half = (N / 2 - 1) as i32;
-    let groups = out.chunks_exact_mut(LANES).zip(u.chunks_exact(LANES)).zip(v.chunks_exact(LANES));
+    let Spread { step, lead, lanes } = field.spread;
     let mut x = x;
-    for ((o, u), v) in groups {
-        let (du, dv) = (V::from_slice(s, u), V::from_slice(s, v));
-        let (ku, kv) = (u[0].floor(), v[0].floor());
+    let (mut node, mut phase) = (lead / step, lead % step);
+    for o in out.chunks_exact_mut(LANES) {
+        let (index, distance) = &lanes[phase];
+        let index = u8x32::from_slice(s, index);
+        let distance = V::from_slice(s, distance);
+        macro_rules! at {
+            ($values:expr) => {
+                V::from_slice(s, &$values[node..node + LANES]).swizzle_dyn(index)
+            };
+        }
+        let du = at!(field.su).mul_add(distance, at!(field.u));
+        let dv = at!(field.sv).mul_add(distance, at!(field.v));
+        phase += LANES;
+        while phase >= *step {
+            phase -= step;
+            node += 1;
+        }
+        let (fx, fy) = (du.floor(), dv.floor());
+        let (ku, kv) = (fx.reduce_min(), fy.reduce_min());
         let (tx, ty) = (du - V::splat(s, ku), dv - V::splat(s, kv));
-        let inside = (tx * (one - tx)).min(ty * (one - ty)).simd_ge(zero);
+        let inside = (one - tx).min(one - ty).simd_ge(zero);
         let g = if inside.all_true() {
             let origin = plane.signed_index(x + ku as i32 - half, y + kv as i32 - half);
             let (wx, wy) = weights::<S, N>(s, tx - centre, ty - centre);
