@@ -104,9 +104,9 @@ pub enum ResultFileError {
     },
 }
 
-/// Nodes per point, at the least twenty million, that a grid may have.
+/// Nodes per point, at the least a million, that a grid may have.
 const NODES_PER_POINT: f64 = 100.0;
-const NODES: f64 = 2e7;
+const NODES: f64 = 1e6;
 /// How far off its node a point may be, in steps.
 const OFF_NODE: f64 = 1e-6;
 /// First line of data.

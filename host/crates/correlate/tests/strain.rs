@@ -356,7 +356,7 @@ impl Ratio {
 #[test]
 fn sigma_predicts_correlated_noise() {
     // errors whose correlation is the overlap of 21 px subsets by construction: means of white noise over
-    // the subsets. Left over is the chance of the repeats: 60 fields of about 40 independent gauges.
+    // the subsets. Left over is the chance of the repeats: 40 fields of about 20 independent gauges.
     const SUBSET: usize = 21;
     const STEP: usize = 5;
     let (columns, rows) = (27usize, 25usize);
@@ -369,7 +369,7 @@ fn sigma_predicts_correlated_noise() {
         (11, Method::SavitzkyGolay(3)),
     ] {
         let (mut inner, mut outer, mut holed) = (Ratio::new(), Ratio::new(), Ratio::new());
-        for seed in 0..60 {
+        for seed in 0..40 {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             let mut f = Field::empty(columns, rows, [0.0, 0.0], STEP as f64, SUBSET, Shape::Affine);
             for values in [&mut f.u, &mut f.v] {
@@ -423,7 +423,7 @@ fn sigma_predicts_correlated_noise() {
             "{method} {window}: said/seen {a:.3} inside, {b:.3} at the edge, {:.3} with holes",
             holed.said_over_seen()
         );
-        // measured within 2.5 %
+        // measured within 2.5 % in 60 fields
         assert!((a - 1.0).abs() < 0.04 && (b - 1.0).abs() < 0.04);
         if matches!(method, Method::Vsg(_)) {
             assert!(holed.count > 1000 && (holed.said_over_seen() - 1.0).abs() < 0.04);
@@ -440,8 +440,8 @@ fn sigma_predicts_correlated_noise() {
 #[test]
 fn sigma_predicts_the_scatter_of_noisy_images() {
     // real subsets of noisy images, not the model they are described with
-    const N: usize = 180;
-    const REPEATS: u64 = 24;
+    const N: usize = 150;
+    const REPEATS: u64 = 16;
     let s = Speckles::new(31, N, N);
     let (a, b) = (s.image(N, N, |_, _| (0.0, 0.0)), s.image(N, N, |_, _| (0.2, 0.0)));
     for shape in [Shape::Affine, Shape::Quadratic] {
@@ -494,7 +494,7 @@ fn golden_affine_strain() {
     let truth =
         [ux + 0.5 * (ux * ux + vx * vx), vy + 0.5 * (uy * uy + vy * vy), 0.5 * (uy + vx + ux * uy + vx * vy)];
     let dic = daic_correlate::Settings::default();
-    for (noise, case, truth) in [("n0", "aff1", truth), ("n2", "aff1", truth), ("n2", "t02", [0.0; 3])] {
+    for (noise, case, truth) in [("n0", "aff1", truth), ("n2", "t02", [0.0; 3])] {
         let read = |name: &str| -> Image { load(&dir.join(format!("s1024_{noise}_{name}.png"))) };
         let roi = daic_correlate::Roi {
             rectangle: Some(daic_correlate::Rectangle { x: 40, y: 40, width: 944, height: 944 }),
@@ -518,7 +518,8 @@ fn golden_affine_strain() {
                 s.gauge(8.0, 33),
                 errors.len()
             );
-            let limits = if noise == "n0" { (2e-6, 1.2e-5) } else { (1e-5, 8e-5) };
+            // measured: bias 2e-7 and scatter 5e-6 (n0), 6e-7 and 2.8e-5 (n2)
+            let limits = if noise == "n0" { (1e-6, 6e-6) } else { (2e-6, 3.5e-5) };
             assert!(bias.abs() < limits.0 && scatter < limits.1);
             // 944 px hold some 40 independent gauges of 145 px: one image pair leaves 10 % of chance
             assert!((said / scatter - 1.0).abs() < 0.2);
