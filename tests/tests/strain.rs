@@ -332,7 +332,10 @@ fn noise_floor_of_static_frames() {
         let ratio = number(&f["u"]["sigma"]) / number(&f["u"]["std"]);
         eprintln!("spatial: said/seen {ratio:.3}");
         assert!((ratio - 1.0).abs() < 0.3, "{ratio}");
-        assert!(number(&f["u_std_without_rigid"]) <= number(&f["u"]["std"]) * 1.000_001);
+        // taking off a rotation lessens the scatter of both together
+        let both = |u: &serde_json::Value, v: &serde_json::Value| number(u).hypot(number(v));
+        let rest = both(&f["u_std_without_rigid"], &f["v_std_without_rigid"]);
+        assert!(rest <= both(&f["u"]["std"], &f["v"]["std"]));
     }
     let t = &answer["temporal_u"];
     let ratio = number(&t["sigma_of_one_frame"]) / number(&t["rms"]);
