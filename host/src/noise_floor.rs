@@ -240,8 +240,8 @@ pub fn measure(
             series[0][node].push(rest[0], field.sigma_u[node]);
             series[1][node].push(rest[1], field.sigma_v[node]);
             let s = &strain.strains[node];
-            for c in 0..3 {
-                series[2 + c][node].push(s.components[c], s.sigma[c]);
+            for (series, (e, sigma)) in series[2..].iter_mut().zip(s.components.into_iter().zip(s.sigma)) {
+                series[node].push(e, sigma);
             }
         }
         let valid = || (0..field.u.len()).filter(|&n| field.is_valid(n));
@@ -346,7 +346,7 @@ mod tests {
     fn a_rigid_motion_is_taken_off_and_nothing_else() {
         let mut f = Field::empty(12, 9, [30.0, 40.0], 7.0, 33, Shape::Affine);
         let (middle, turn) = ([30.0 + 5.5 * 7.0, 40.0 + 4.0 * 7.0], 3e-4);
-        for n in 0..f.u.len() {
+        for n in 0..f.valid.len() {
             let [x, y] = f.position(n);
             let (x, y) = (x - middle[0], y - middle[1]);
             // a shear without rotation stays

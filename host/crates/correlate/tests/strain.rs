@@ -1,5 +1,7 @@
 //! Strain against analytic fields, transfer functions and Monte-Carlo noise.
 
+#![allow(clippy::needless_range_loop)] // nodes number several arrays at once
+
 mod common;
 use common::*;
 use daic_correlate::strain::{
