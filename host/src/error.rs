@@ -108,6 +108,43 @@ pub enum Error {
     /// The correlation.
     #[error(transparent)]
     Correlate(#[from] daic_correlate::CorrelateError),
+    /// A file of points.
+    #[error(transparent)]
+    ResultFile(#[from] crate::result_file::ResultFileError),
+    /// Strain or a probe.
+    #[error("the strain cannot be computed: {0}")]
+    Strain(#[from] daic_correlate::strain::StrainError),
+    /// A polynomial that the virtual strain gauge does not have.
+    #[error(
+        "the virtual strain gauge fits a plane or a quadratic, not order {order}: use --order plane or --order quadratic, or --method savitzky-golay"
+    )]
+    VsgOrder {
+        /// Order asked for.
+        order: u8,
+    },
+    /// No probe was named.
+    #[error(
+        "no probe was given: add --point X,Y, --line X0,Y0,X1,Y1 or --extensometer X0,Y0,X1,Y1 (repeatable)"
+    )]
+    NoProbe,
+    /// One frame, where noise needs two.
+    #[error("a noise floor needs at least two images, {found} given")]
+    TooFewFrames {
+        /// Images given.
+        found: usize,
+    },
+    /// Static frames of which one has nothing in common with the first.
+    #[error(
+        "{}: only {ok} of {points} points could be correlated with the first frame; are these frames of the same, unmoved specimen?", path.display()
+    )]
+    NotStatic {
+        /// The frame.
+        path: PathBuf,
+        /// Points with a result.
+        ok: usize,
+        /// Points.
+        points: usize,
+    },
     /// The two views.
     #[error("the two first-order views were not found: {0}")]
     Views(#[from] daic_correlate::ViewsError),

@@ -58,6 +58,14 @@ pub fn map_figure(
     })
 }
 
+/// A map as it is, with axes and colour bar, as an SVG document.
+///
+/// # Errors
+/// If the figure cannot be drawn.
+pub fn map_svg(map: &FloatMap, title: &str, quantity: &str) -> Result<String, Error> {
+    Ok(heatmap(map, title, quantity, &map.unit, 1.0).render_svg()?.as_str().to_owned())
+}
+
 /// Unit in which a map of millimetres is drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unit {

@@ -22,16 +22,26 @@ pub fn read(path: &Path) -> Result<GreyImage, Error> {
 /// # Errors
 /// The file, and what is wrong with it.
 pub fn read_pair(reference: &Path, deformed: &Path) -> Result<(GreyImage, GreyImage), Error> {
-    let (a, b) = (read(reference)?, read(deformed)?);
-    if (a.width, a.height) != (b.width, b.height) {
+    let a = read(reference)?;
+    let b = read_like(deformed, &a, reference)?;
+    Ok((a, b))
+}
+
+/// Reads an image that has the size of `other`, which was read from `other_path`.
+///
+/// # Errors
+/// The file, and what is wrong with it.
+pub fn read_like(path: &Path, other: &GreyImage, other_path: &Path) -> Result<GreyImage, Error> {
+    let image = read(path)?;
+    if (image.width, image.height) != (other.width, other.height) {
         return Err(Error::SizesDiffer {
-            path: deformed.to_owned(),
-            other: reference.to_owned(),
-            found_width: b.width,
-            found_height: b.height,
-            width: a.width,
-            height: a.height,
+            path: path.to_owned(),
+            other: other_path.to_owned(),
+            found_width: image.width,
+            found_height: image.height,
+            width: other.width,
+            height: other.height,
         });
     }
-    Ok((a, b))
+    Ok(image)
 }

@@ -8,7 +8,8 @@
 //! * [`measure`]: frames with two views become points and displacements.
 //! * [`recording`]: a run of the rig becomes a dataset.
 //! * [`process`]: a dataset becomes results, summary and report.
-//! * [`pair`]: plain 2D-DIC of two images.
+//! * [`pair`]: plain 2D-DIC of two images; [`strain`] and [`probe`] work on its results, [`noise_floor`]
+//!   says what such a measurement can resolve.
 
 #[cfg(feature = "sim")]
 pub mod demo;
@@ -19,15 +20,19 @@ mod figures;
 pub mod folder_camera;
 pub mod images;
 pub mod measure;
+pub mod noise_floor;
 pub mod optics_section;
 pub mod pair;
+pub mod probe;
 pub mod process;
 pub mod progress;
 pub mod recording;
 pub mod reports;
+pub mod result_file;
 pub mod settings;
 #[cfg(feature = "sim")]
 pub mod simulated;
+pub mod strain;
 pub mod usage;
 mod verdicts;
 

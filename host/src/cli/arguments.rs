@@ -1,5 +1,6 @@
 //! Commands and their flags.
 
+use super::strain::{NoiseFloorArgs, ProbeArgs, StrainArgs};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
@@ -34,6 +35,12 @@ pub enum Command {
     Process(ProcessArgs),
     /// Correlate two images (2D-DIC)
     Correlate(CorrelateArgs),
+    /// Strain from the points of `daic correlate`
+    Strain(StrainArgs),
+    /// Values at points and along lines, virtual extensometers, from the points of `daic correlate`
+    Probe(ProbeArgs),
+    /// Noise of displacement and strain, from frames of a specimen that does not move
+    NoiseFloor(NoiseFloorArgs),
     /// Height map of one frame with both first-order views
     Profile(ProfileArgs),
     /// 3D displacement from one frame with both views to another
@@ -227,7 +234,7 @@ pub struct Move(pub [f64; 3]);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Roi(pub [i64; 4]);
 
-fn numbers<T: std::str::FromStr, const N: usize>(text: &str, form: &str) -> Result<[T; N], String> {
+pub fn numbers<T: std::str::FromStr, const N: usize>(text: &str, form: &str) -> Result<[T; N], String> {
     let parsed: Option<Vec<T>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
     parsed
         .and_then(|values| <[T; N]>::try_from(values).ok())
@@ -247,6 +254,6 @@ fn parse_move(text: &str) -> Result<Move, String> {
     Ok(Move(values))
 }
 
-fn parse_roi(text: &str) -> Result<Roi, String> {
+pub fn parse_roi(text: &str) -> Result<Roi, String> {
     numbers(text, "X,Y,WIDTH,HEIGHT in pixels").map(Roi)
 }

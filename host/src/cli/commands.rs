@@ -148,10 +148,10 @@ pub fn correlate(arguments: &CorrelateArgs, output: &Output) -> Result<Answer, E
     Ok(Answer::new(json, text))
 }
 
-type TableWriter = fn(&daic_dataset::Table, &Path) -> Result<(), daic_dataset::TableError>;
+pub type TableWriter = fn(&daic_dataset::Table, &Path) -> Result<(), daic_dataset::TableError>;
 
 /// How a table is written, decided before the work begins.
-fn table_writer(path: &Path) -> Result<TableWriter, Error> {
+pub fn table_writer(path: &Path) -> Result<TableWriter, Error> {
     match path.extension().and_then(|e| e.to_str()) {
         Some("csv") => Ok(daic_dataset::Table::write_csv),
         Some("npz") => Ok(daic_dataset::Table::write_npz),
@@ -159,7 +159,7 @@ fn table_writer(path: &Path) -> Result<TableWriter, Error> {
     }
 }
 
-fn rectangle(roi: Roi, image: &GreyImage) -> Result<Rectangle, Error> {
+pub fn rectangle(roi: Roi, image: &GreyImage) -> Result<Rectangle, Error> {
     let [x, y, w, h] = roi.0;
     let (width, height) = (image.width, image.height);
     let outside = Error::RoiOutside { x, y, w, h, width, height };
@@ -173,22 +173,27 @@ fn rectangle(roi: Roi, image: &GreyImage) -> Result<Rectangle, Error> {
     Ok(Rectangle { x, y, width, height })
 }
 
-fn apply(arguments: &DicArgs, settings: &mut daic_correlate::Settings, step: &mut usize) {
+pub fn apply(arguments: &DicArgs, settings: &mut daic_correlate::Settings, step: &mut usize) {
     if let Some(subset) = arguments.subset {
         settings.subset = subset as usize;
     }
     if let Some(given) = arguments.step {
         *step = given as usize;
     }
-    match arguments.shape {
-        Some(ShapeArg::Affine) => settings.shape = daic_correlate::Shape::Affine,
-        Some(ShapeArg::Quadratic) => settings.shape = daic_correlate::Shape::Quadratic,
-        None => {}
+    if let Some(given) = arguments.shape {
+        settings.shape = shape(given);
     }
     match arguments.interpolation {
         Some(InterpolationArg::Cubic) => settings.interpolation = daic_correlate::Interpolation::Cubic,
         Some(InterpolationArg::Quintic) => settings.interpolation = daic_correlate::Interpolation::Quintic,
         None => {}
+    }
+}
+
+pub fn shape(shape: ShapeArg) -> daic_correlate::Shape {
+    match shape {
+        ShapeArg::Affine => daic_correlate::Shape::Affine,
+        ShapeArg::Quadratic => daic_correlate::Shape::Quadratic,
     }
 }
 
@@ -295,7 +300,7 @@ pub fn doctor(arguments: &DoctorArgs) -> Result<Answer, Error> {
     Ok(Answer::new(as_json(&found)?, text))
 }
 
-fn as_json(value: &impl serde::Serialize) -> Result<serde_json::Value, Error> {
+pub fn as_json(value: &impl serde::Serialize) -> Result<serde_json::Value, Error> {
     serde_json::to_value(value)
         .map_err(|source| Error::Unwritable { path: "the answer".into(), reason: source.to_string() })
 }

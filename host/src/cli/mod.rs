@@ -3,6 +3,7 @@
 mod arguments;
 mod commands;
 mod output;
+mod strain;
 
 use arguments::{Cli, Command};
 use clap::Parser as _;
@@ -48,6 +49,9 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Run(arguments) => commands::run(arguments, output),
         Command::Process(arguments) => commands::process(arguments, output),
         Command::Correlate(arguments) => commands::correlate(arguments, output),
+        Command::Strain(arguments) => strain::strain(arguments, output),
+        Command::Probe(arguments) => strain::probe(arguments),
+        Command::NoiseFloor(arguments) => strain::noise_floor(arguments, output),
         Command::Profile(arguments) => commands::profile(arguments, output),
         Command::Displacement(arguments) => commands::displacement(arguments, output),
         Command::Init(arguments) => commands::init(arguments),

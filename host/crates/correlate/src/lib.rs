@@ -4,6 +4,8 @@
 //! zero-normalised sum of squared differences, B-spline interpolation, initial guesses that reach
 //! across half the image, a status and an uncertainty for every point.
 //!
+//! Strain, virtual extensometers and probes on the result are in [`strain`].
+//!
 //! Conventions: pixel (0, 0) has its centre at (0, 0), x to the right, y down; displacements are
 //! Lagrangian, in pixels.
 #![forbid(unsafe_code)]
@@ -28,6 +30,7 @@ mod scalar;
 mod settings;
 mod shape;
 mod simd;
+pub mod strain;
 mod subset;
 mod views;
 
