@@ -9,6 +9,7 @@
 //! * [`recording`]: a run of the rig becomes a dataset.
 //! * [`process`]: a dataset becomes results, summary and report.
 //! * [`pair`]: plain 2D-DIC of two images.
+//! * [`phase`]: phases of gratings and displacements from them.
 
 #[cfg(feature = "sim")]
 pub mod demo;
@@ -21,6 +22,7 @@ pub mod images;
 pub mod measure;
 pub mod optics_section;
 pub mod pair;
+pub mod phase;
 pub mod process;
 pub mod progress;
 pub mod recording;

@@ -48,6 +48,7 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Run(arguments) => commands::run(arguments, output),
         Command::Process(arguments) => commands::process(arguments, output),
         Command::Correlate(arguments) => commands::correlate(arguments, output),
+        Command::Phase(arguments) => commands::phase(arguments, output),
         Command::Profile(arguments) => commands::profile(arguments, output),
         Command::Displacement(arguments) => commands::displacement(arguments, output),
         Command::Init(arguments) => commands::init(arguments),

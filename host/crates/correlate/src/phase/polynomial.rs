@@ -9,6 +9,17 @@ pub(super) struct Polynomial {
     half: f64,
 }
 
+/// A value to be fitted.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Node {
+    pub(super) x: f64,
+    pub(super) y: f64,
+    pub(super) value: f64,
+    pub(super) weight: f64,
+    /// Which constant belongs to it.
+    pub(super) group: usize,
+}
+
 /// Legendre polynomials P₀…P_n at t.
 fn legendre(n: usize, t: f64, out: &mut [f64]) {
     out[0] = 1.0;
@@ -44,24 +55,29 @@ impl Polynomial {
         }
     }
 
-    /// Least squares through (x, y, value) with weights; `None` where the points do not determine
-    /// the coefficients.
-    pub(super) fn fit(mut self, points: &[[f64; 4]]) -> Option<Self> {
-        let n = self.c.len();
+    /// Weighted least squares through `nodes`, with a constant of its own for each of `groups` groups
+    /// of them, that of the first being zero; `None` where the nodes do not determine the
+    /// coefficients. Returns the polynomial and the constants.
+    pub(super) fn fit(mut self, nodes: &[Node], groups: usize) -> Option<(Self, Vec<f64>)> {
+        let terms = self.c.len();
+        let n = terms + groups.saturating_sub(1);
         let mut a = vec![0.0; n * n];
         let mut b = vec![0.0; n];
         let mut p = Vec::with_capacity(n);
-        for &[x, y, value, weight] in points {
-            self.basis(x, y, &mut p);
+        for node in nodes {
+            self.basis(node.x, node.y, &mut p);
+            p.extend((1..groups).map(|g| f64::from(g == node.group)));
             for i in 0..n {
-                b[i] += weight * p[i] * value;
+                b[i] += node.weight * p[i] * node.value;
                 for j in 0..=i {
-                    a[i * n + j] += weight * p[i] * p[j];
+                    a[i * n + j] += node.weight * p[i] * p[j];
                 }
             }
         }
-        self.c = cholesky(a, b, n)?;
-        Some(self)
+        let mut solution = cholesky(a, b, n)?;
+        let constants = std::iter::once(0.0).chain(solution.drain(terms..)).collect();
+        self.c = solution;
+        Some((self, constants))
     }
 
     /// Value at (x, y).
@@ -160,13 +176,15 @@ mod tests {
     #[test]
     fn fits_what_it_can_represent() {
         let f = |x: f64, y: f64| 3.0 + 0.1 * x - 2e-4 * x * y + 1e-6 * x * x * y - 3e-9 * y.powi(4);
-        let mut points = Vec::new();
+        let mut nodes = Vec::new();
         for y in (0..200).step_by(7) {
             for x in (0..300).step_by(11) {
-                points.push([f64::from(x), f64::from(y), f(f64::from(x), f64::from(y)), 1.0]);
+                let (group, x, y) = (usize::from(x > 150), f64::from(x), f64::from(y));
+                nodes.push(Node { x, y, value: f(x, y) + 7.5 * group as f64, weight: 1.0, group });
             }
         }
-        let p = Polynomial::zero(300, 200, 5).fit(&points).unwrap();
+        let (p, constants) = Polynomial::zero(300, 200, 5).fit(&nodes, 2).unwrap();
+        assert!(constants[0] == 0.0 && (constants[1] - 7.5).abs() < 1e-8);
         for (x, y) in [(0.0, 0.0), (299.0, 3.5), (120.25, 199.0)] {
             assert!((p.at(x, y) - f(x, y)).abs() < 1e-9, "{} {}", p.at(x, y), f(x, y));
             assert!((p.row(y).at(x) - f(x, y)).abs() < 1e-9);
@@ -175,6 +193,7 @@ mod tests {
 
     #[test]
     fn too_few_points_are_refused() {
-        assert!(Polynomial::zero(10, 10, 2).fit(&[[1.0, 1.0, 2.0, 1.0]; 9]).is_none());
+        let node = Node { x: 1.0, y: 1.0, value: 2.0, weight: 1.0, group: 0 };
+        assert!(Polynomial::zero(10, 10, 2).fit(&[node; 9], 1).is_none());
     }
 }

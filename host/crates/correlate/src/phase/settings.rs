@@ -69,7 +69,7 @@ impl Default for PhaseSettings {
     fn default() -> Self {
         Self {
             window: WindowKind::Gaussian,
-            width: 2.0,
+            width: 2.5,
             gratings: Gratings::Auto,
             pitch: None,
             noise: None,

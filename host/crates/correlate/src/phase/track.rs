@@ -1,7 +1,7 @@
 //! The local carrier: phase of the grating, roughly, as a polynomial over the image.
 
 use super::carrier::Carrier;
-use super::polynomial::{Polynomial, Row};
+use super::polynomial::{Node, Polynomial, Row};
 use super::settings::WindowKind;
 use super::unwrap::unwrap;
 use super::window::Window;
@@ -46,8 +46,11 @@ const NARROW: f64 = 1.0;
 /// Phase that the polynomial may miss a node by to count in the second fit, radians.
 const OUTLIER: f64 = 1.5;
 
+/// Connected parts that the polynomial is fitted to, each up to a constant of its own.
+const MOST_PARTS: usize = 16;
+
 /// Follows the carrier over the image: phases at nodes half a pitch apart by a narrow window, unwrapped, and a
-/// polynomial of up to `degree` through the largest connected part of them.
+/// polynomial of up to `degree` through their connected parts.
 ///
 /// `None` where no node has a whole window inside image and mask.
 pub(super) fn track(
@@ -106,22 +109,24 @@ pub(super) fn track(
         })
         .collect();
     let unwrapped = unwrap(columns, &wrapped, &valid);
-    let mut points: Vec<[f64; 4]> = (0..columns * rows)
-        .filter(|&k| unwrapped.label[k] == 1)
+    let groups = unwrapped.components.min(MOST_PARTS);
+    let mut points: Vec<Node> = (0..columns * rows)
+        .filter(|&k| (1..=groups).contains(&(unwrapped.label[k] as usize)))
         .map(|k| {
             let (x, y) = position(k);
-            [x, y, unwrapped.phase[k], psi[k].norm_sqr() / f64::from(strong).powi(2)]
+            let weight = psi[k].norm_sqr() / f64::from(strong).powi(2);
+            Node { x, y, value: unwrapped.phase[k], weight, group: unwrapped.label[k] as usize - 1 }
         })
         .collect();
     let mut rest = None;
     for round in 0..2 {
-        let fit = (0..=degree)
+        let (fit, constants) = (0..=degree)
             .rev()
             // enough nodes for every term
-            .filter(|d| 4 * (d + 1) * (d + 2) / 2 <= points.len() || *d == 0)
-            .find_map(|d| Polynomial::zero(width, height, d).fit(&points))?;
+            .filter(|d| 4 * ((d + 1) * (d + 2) / 2 + groups) <= points.len() || *d == 0)
+            .find_map(|d| Polynomial::zero(width, height, d).fit(&points, groups))?;
         if round == 0 {
-            points.retain(|p| (p[2] - fit.at(p[0], p[1])).abs() < OUTLIER);
+            points.retain(|p| (p.value - constants[p.group] - fit.at(p.x, p.y)).abs() < OUTLIER);
         }
         rest = Some(fit);
         if points.is_empty() {
