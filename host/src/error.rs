@@ -145,6 +145,9 @@ pub enum Error {
         /// Points.
         points: usize,
     },
+    /// The phases of a grating.
+    #[error("no phases: {0}")]
+    Phase(#[from] daic_correlate::phase::PhaseError),
     /// The two views.
     #[error("the two first-order views were not found: {0}")]
     Views(#[from] daic_correlate::ViewsError),

@@ -35,6 +35,15 @@ pub fn write_map_png(path: &Path, map: &FloatMap) -> Result<(), Error> {
     Ok(atomic::write_bytes(path, &png)?)
 }
 
+/// Writes the map with title, axes and colour bar, in its own unit.
+///
+/// # Errors
+/// If the figure cannot be drawn or written.
+pub fn write_map_svg(path: &Path, map: &FloatMap, title: &str, quantity: &str) -> Result<(), Error> {
+    let figure = heatmap(map, title, quantity, &map.unit, 1.0).render_svg()?;
+    Ok(atomic::write_bytes(path, figure.as_str().as_bytes())?)
+}
+
 /// A map of millimetres, drawn in micrometres or millimetres, with axes and colour bar.
 ///
 /// # Errors

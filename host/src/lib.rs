@@ -10,6 +10,7 @@
 //! * [`process`]: a dataset becomes results, summary and report.
 //! * [`pair`]: plain 2D-DIC of two images; [`strain`] and [`probe`] work on its results, [`noise_floor`]
 //!   says what such a measurement can resolve.
+//! * [`phase`]: phases of gratings and displacements from them.
 
 #[cfg(feature = "sim")]
 pub mod demo;
@@ -24,6 +25,7 @@ pub mod noise_floor;
 pub mod optics_section;
 pub mod pair;
 pub mod probe;
+pub mod phase;
 pub mod process;
 pub mod progress;
 pub mod recording;

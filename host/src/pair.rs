@@ -29,25 +29,33 @@ impl PairResult {
         self.points.iter().filter(|p| p.status.is_ok()).count()
     }
 
-    /// `x,y,u,v,sigma_u,sigma_v,zncc,iterations,status`, pixels, a row per point.
+    /// See [`point_table`].
     ///
     /// # Errors
     /// Only if two columns had one name.
     pub fn table(&self) -> Result<Table, Error> {
-        let column = |f: &dyn Fn(&Point) -> f64| Column::F64(self.points.iter().map(f).collect());
-        let iterations = self.points.iter().map(|p| i64::from(p.iterations)).collect();
-        let status = self.points.iter().map(|p| p.status.name().to_owned()).collect();
-        Ok(Table::new()
-            .with("x", column(&|p| p.x))?
-            .with("y", column(&|p| p.y))?
-            .with("u", column(&|p| p.u))?
-            .with("v", column(&|p| p.v))?
-            .with("sigma_u", column(&|p| f64::from(p.sigma_u)))?
-            .with("sigma_v", column(&|p| f64::from(p.sigma_v)))?
-            .with("zncc", column(&|p| f64::from(p.zncc)))?
-            .with("iterations", Column::I64(iterations))?
-            .with("status", Column::Text(status))?)
+        point_table(&self.points)
     }
+}
+
+/// `x,y,u,v,sigma_u,sigma_v,zncc,iterations,status`, pixels, a row per point.
+///
+/// # Errors
+/// Only if two columns had one name.
+pub fn point_table(points: &[Point]) -> Result<Table, Error> {
+    let column = |f: &dyn Fn(&Point) -> f64| Column::F64(points.iter().map(f).collect());
+    let iterations = points.iter().map(|p| i64::from(p.iterations)).collect();
+    let status = points.iter().map(|p| p.status.name().to_owned()).collect();
+    Ok(Table::new()
+        .with("x", column(&|p| p.x))?
+        .with("y", column(&|p| p.y))?
+        .with("u", column(&|p| p.u))?
+        .with("v", column(&|p| p.v))?
+        .with("sigma_u", column(&|p| f64::from(p.sigma_u)))?
+        .with("sigma_v", column(&|p| f64::from(p.sigma_v)))?
+        .with("zncc", column(&|p| f64::from(p.zncc)))?
+        .with("iterations", Column::I64(iterations))?
+        .with("status", Column::Text(status))?)
 }
 
 /// Watches the stages to time them, and hands the progress on.

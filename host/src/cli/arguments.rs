@@ -41,6 +41,8 @@ pub enum Command {
     Probe(ProbeArgs),
     /// Noise of displacement and strain, from frames of a specimen that does not move
     NoiseFloor(NoiseFloorArgs),
+    /// Phases of a line or cross grating; with a second image, the displacement between both
+    Phase(PhaseArgs),
     /// Height map of one frame with both first-order views
     Profile(ProfileArgs),
     /// 3D displacement from one frame with both views to another
@@ -132,6 +134,58 @@ pub struct CorrelateArgs {
     /// Points to this file (.csv or .npz)
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct PhaseArgs {
+    /// Image of a grating; the reference where there are two
+    pub image: PathBuf,
+    /// Deformed image of the same grating
+    pub deformed: Option<PathBuf>,
+    /// Pitch in pixels to look for, to within 25 % (default: the strongest pattern)
+    #[arg(long, value_name = "PX")]
+    pub pitch: Option<f64>,
+    /// Directions to look for
+    #[arg(long, default_value = "auto")]
+    pub gratings: GratingsArg,
+    /// Analysis window
+    #[arg(long, default_value = "gaussian")]
+    pub window: WindowArg,
+    /// Width of the window in pitches: standard deviation of the Gaussians, half base of the triangle
+    #[arg(long, value_name = "PITCHES", default_value_t = 2.5)]
+    pub width: f64,
+    /// Noise of an image in grey levels (default: estimated from its spectrum)
+    #[arg(long, value_name = "GREY")]
+    pub noise: Option<f64>,
+    /// Displacement in pixels to start from; without it, it must be less than half a pitch in the median
+    #[arg(long, value_name = "U,V", value_parser = parse_shift, allow_hyphen_values = true)]
+    pub shift: Option<Shift>,
+    /// Distance of the points in points.csv in pixels
+    #[arg(long, value_name = "PX", default_value_t = 5)]
+    pub step: u32,
+    /// Folder for maps, points and figures
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum GratingsArg {
+    /// What the spectrum shows
+    Auto,
+    /// Parallel lines
+    Line,
+    /// Two directions
+    Cross,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum WindowArg {
+    /// Gaussian
+    Gaussian,
+    /// Gaussian that leaves quadratic phase as it is, at more noise
+    GaussianFlat,
+    /// Product of two triangles
+    BiTriangular,
 }
 
 /// Subset settings; what is not given comes from the optics or experiment file, or the default.
@@ -234,6 +288,10 @@ pub struct Move(pub [f64; 3]);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Roi(pub [i64; 4]);
 
+/// Displacement in pixels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Shift(pub [f64; 2]);
+
 pub fn numbers<T: std::str::FromStr, const N: usize>(text: &str, form: &str) -> Result<[T; N], String> {
     let parsed: Option<Vec<T>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
     parsed
@@ -256,4 +314,13 @@ fn parse_move(text: &str) -> Result<Move, String> {
 
 pub fn parse_roi(text: &str) -> Result<Roi, String> {
     numbers(text, "X,Y,WIDTH,HEIGHT in pixels").map(Roi)
+}
+
+fn parse_shift(text: &str) -> Result<Shift, String> {
+    let values = numbers(text, "U,V in pixels, for example 12.5,-3")?;
+    if values.iter().all(|v: &f64| v.abs() <= 65_536.0) {
+        Ok(Shift(values))
+    } else {
+        Err(format!("found `{text}`, allowed are -65536 to 65536 pixels"))
+    }
 }

@@ -1,14 +1,17 @@
 //! What each command does: arguments to facade calls, results to an answer.
 
 use super::arguments::{
-    CorrelateArgs, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, InitArgs, InterpolationArg,
-    ProcessArgs, ProfileArgs, Roi, RunArgs, ShapeArg,
+    CorrelateArgs, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, GratingsArg, InitArgs,
+    InterpolationArg, PhaseArgs, ProcessArgs, ProfileArgs, Roi, RunArgs, ShapeArg, WindowArg,
 };
 #[cfg(feature = "sim")]
 use super::arguments::{DemoArgs, SimulateArgs};
 use super::output::{Answer, Output};
 use daic::measure::{self, Rectangle, Reference};
-use daic::{Error, doctor as checks, images, optics_section, pair, process as processing, reports};
+use daic::{
+    Error, Progress as _, doctor as checks, images, optics_section, pair, phase as gratings,
+    process as processing, reports,
+};
 use daic_dataset::{Existing, GreyImage, atomic};
 use daic_optics::{Decoder, OpticalModel};
 use daic_rig::experiment::{self, Experiment, OpticsFile};
@@ -145,6 +148,93 @@ pub fn correlate(arguments: &CorrelateArgs, output: &Output) -> Result<Answer, E
         v.mean,
         v.std
     );
+    Ok(Answer::new(json, text))
+}
+
+pub fn phase(arguments: &PhaseArgs, output: &Output) -> Result<Answer, Error> {
+    use daic_correlate::phase::{Gratings, PhaseSettings, WindowKind};
+    let settings = PhaseSettings {
+        window: match arguments.window {
+            WindowArg::Gaussian => WindowKind::Gaussian,
+            WindowArg::GaussianFlat => WindowKind::GaussianFlat,
+            WindowArg::BiTriangular => WindowKind::BiTriangular,
+        },
+        width: arguments.width,
+        gratings: match arguments.gratings {
+            GratingsArg::Auto => Gratings::Auto,
+            GratingsArg::Line => Gratings::Line,
+            GratingsArg::Cross => Gratings::Cross,
+        },
+        pitch: arguments.pitch,
+        noise: arguments.noise,
+        ..PhaseSettings::default()
+    };
+    let (image, deformed) = match &arguments.deformed {
+        None => (images::read(&arguments.image)?, None),
+        Some(path) => {
+            let (a, b) = images::read_pair(&arguments.image, path)?;
+            (a, Some(b))
+        }
+    };
+    let clock = daic::usage::Clock::start();
+    output.stage("finding phases", 0);
+    let maps = gratings::analyse(&image, &settings)?;
+    let moved = match &deformed {
+        None => None,
+        Some(deformed) => {
+            let deformed = gratings::analyse(deformed, &settings)?;
+            let shift = arguments.shift.map_or([0.0; 2], |s| s.0);
+            let found = gratings::displacement(&maps, &deformed, shift, arguments.step as usize)?;
+            let numbers = gratings::displacement_summary(&found)?;
+            Some((found, numbers))
+        }
+    };
+    let spent = clock.elapsed();
+    let summary = gratings::summary(&maps);
+    if let Some(out) = &arguments.out {
+        make_folder(out)?;
+        gratings::write_maps(out, &maps)?;
+        if let Some((found, _)) = &moved {
+            gratings::write_displacement(out, found)?;
+        }
+    }
+    let mut text = String::new();
+    for d in &summary.directions {
+        writeln!(
+            text,
+            "pitch {:.4} px at {:.3}°: {} of {} pixels in {} parts, {} residues, σ of a phase {:.2e} rad = {:.2e} px, window {} px",
+            d.pitch_px,
+            d.angle_deg,
+            d.valid,
+            summary.pixels,
+            d.components,
+            d.residues,
+            d.sigma_rad,
+            d.sigma_px,
+            d.window_px
+        )
+        .ok();
+    }
+    if let Some((_, m)) = &moved {
+        let ([u, v], [du, dv], [su, sv]) = (m.mean_px, m.std_px, m.sigma_px);
+        writeln!(
+            text,
+            "{} of {} points: u {u:.4} ± {du:.4} px, v {v:.4} ± {dv:.4} px (mean and scatter), σ from noise {su:.2e} and {sv:.2e} px",
+            m.converged, m.points
+        )
+        .ok();
+        if let Some([x, y]) = m.line_normal {
+            writeln!(text, "a line grating: only the displacement along ({x:.3}, {y:.3}) is measured").ok();
+        }
+    }
+    let json = json!({
+        "phase": as_json(&summary)?,
+        "displacement": moved.as_ref().map(|(_, m)| as_json(m)).transpose()?,
+        "settings": as_json(&settings)?,
+        "cpu_s": spent.cpu,
+        "wall_s": spent.wall,
+        "out": arguments.out.as_ref().map(|p| p.display().to_string()),
+    });
     Ok(Answer::new(json, text))
 }
 

@@ -52,6 +52,7 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Strain(arguments) => strain::strain(arguments, output),
         Command::Probe(arguments) => strain::probe(arguments),
         Command::NoiseFloor(arguments) => strain::noise_floor(arguments, output),
+        Command::Phase(arguments) => commands::phase(arguments, output),
         Command::Profile(arguments) => commands::profile(arguments, output),
         Command::Displacement(arguments) => commands::displacement(arguments, output),
         Command::Init(arguments) => commands::init(arguments),

@@ -20,6 +20,7 @@ mod image;
 mod kernel;
 mod noise;
 mod normal;
+pub mod phase;
 mod plane;
 mod point;
 mod points;

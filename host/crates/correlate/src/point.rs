@@ -14,6 +14,8 @@ pub enum SolvedBy {
     Dense,
     /// Own iteration on the part of the subset on the point's side of a discontinuity.
     Split,
+    /// No subset: the phases of a grating.
+    Phase,
 }
 
 impl SolvedBy {
@@ -23,6 +25,7 @@ impl SolvedBy {
             SolvedBy::Exact => "exact",
             SolvedBy::Dense => "dense",
             SolvedBy::Split => "split",
+            SolvedBy::Phase => "phase",
         }
     }
 }
