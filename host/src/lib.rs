@@ -9,6 +9,7 @@
 //! * [`recording`]: a run of the rig becomes a dataset.
 //! * [`process`]: a dataset becomes results, summary and report.
 //! * [`pair`]: plain 2D-DIC of two images.
+//! * [`sequence`]: the same of a series of images.
 
 #[cfg(feature = "sim")]
 pub mod demo;
@@ -17,6 +18,7 @@ pub mod error;
 pub mod expand;
 mod figures;
 pub mod folder_camera;
+pub mod frames;
 pub mod images;
 pub mod measure;
 pub mod optics_section;
@@ -25,6 +27,7 @@ pub mod process;
 pub mod progress;
 pub mod recording;
 pub mod reports;
+pub mod sequence;
 pub mod settings;
 #[cfg(feature = "sim")]
 pub mod simulated;

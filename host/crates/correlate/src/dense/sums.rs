@@ -83,7 +83,14 @@ impl SumBuffers {
 
     /// Sums of the subsets whose last row of tiles is `b`.
     #[inline(always)]
-    pub(crate) fn subsets<S: Simd>(&mut self, s: S, tiling: &Tiling, task: &Task, groups: &[Group], b: usize) {
+    pub(crate) fn subsets<S: Simd>(
+        &mut self,
+        s: S,
+        tiling: &Tiling,
+        task: &Task,
+        groups: &[Group],
+        b: usize,
+    ) {
         let (q, rem) = tiling.whole();
         let slots = tiling.last() + 1;
         let slot = self.ring.len() / slots;
@@ -95,7 +102,11 @@ impl SumBuffers {
                 for i in 0..=g.degree {
                     let at = std::array::from_fn(|e| (plane + monomial(i, e)) * w);
                     let row = |m: usize| {
-                        if m < q { &self.ring[(first + m) % slots * slot..][..slot] } else { &self.ring_part[..] }
+                        if m < q {
+                            &self.ring[(first + m) % slots * slot..][..slot]
+                        } else {
+                            &self.ring_part[..]
+                        }
                     };
                     let out = &mut self.subsets;
                     let tiles = q + usize::from(rem > 0);
