@@ -308,7 +308,8 @@ fn a_real_series() {
         let [u, v, s] = ["u", "v", "sigma_v"].map(|n| table.numbers(n, &path).expect("numbers"));
         last.push((u, v, status, s));
     }
-    // the ways must lead to the same place
+    // The ways must lead to the same place. Found: 0.029 px in u (0.0055 of it scatter, the rest an
+    // offset that grows by 0.003 px with every reference) and 0.010 px in v
     let (a, b) = (&last[0], &last[1]);
     let mut squares = [0.0; 4];
     let mut count = 0.0;
@@ -324,5 +325,5 @@ fn a_real_series() {
     eprintln!(
         "fixed and incremental differ by {du:.4}, {dv:.4} px RMS; σ {fixed:.4} and {incremental:.4} px"
     );
-    assert!(count > 900.0 && du < 0.03 && dv < 0.03, "{count} points, {du} {dv}");
+    assert!(count > 900.0 && du < 0.033 && dv < 0.012, "{count} points, {du} {dv}");
 }
