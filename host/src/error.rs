@@ -88,6 +88,70 @@ pub enum Error {
     /// A file that could not be written.
     #[error(transparent)]
     Write(#[from] daic_dataset::WriteError),
+    /// A folder or a pattern without images.
+    #[error("{} holds no images: TIFF, PNG and BMP files are looked for", path.display())]
+    NoFrameFiles {
+        /// The folder or the pattern.
+        path: PathBuf,
+    },
+    /// A pattern that cannot be one.
+    #[error("{} is no pattern for file names: {reason}", path.display())]
+    Pattern {
+        /// The pattern.
+        path: PathBuf,
+        /// Why.
+        reason: String,
+    },
+    /// A series of images whose results have no place.
+    #[error("{frames} images are correlated with {}: name a folder for the results with --out FOLDER", reference.display())]
+    NoFolder {
+        /// Images given.
+        frames: usize,
+        /// The first image.
+        reference: PathBuf,
+    },
+    /// A folder with something else in it.
+    #[error("{} holds something else than a sequence of daic; choose another folder", path.display())]
+    FolderTaken {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// Results of a sequence with other settings.
+    #[error("{} belongs to another run ({what}); choose another folder, or replace its results with --overwrite", path.display())]
+    SequenceDiffers {
+        /// The file with the settings.
+        path: PathBuf,
+        /// What differs.
+        what: String,
+    },
+    /// A frame of an interrupted sequence that is not what it was.
+    #[error("the results in {} cannot be continued: frame {frame} ({file}) {reason}; choose another folder, or replace its results with --overwrite", out.display())]
+    ResumeFrame {
+        /// Number of the frame.
+        frame: usize,
+        /// Its image when it was measured.
+        file: String,
+        /// The folder.
+        out: PathBuf,
+        /// What has changed.
+        reason: &'static str,
+    },
+    /// The state of an interrupted sequence cannot be read.
+    #[error("{} is damaged, the sequence cannot be continued; begin anew with --overwrite", path.display())]
+    ResumeDamaged {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Stopped by the user.
+    #[error("interrupted after {done} of {total} frames; the same command goes on where it stopped (results in {})", out.display())]
+    Interrupted {
+        /// Frames done.
+        done: usize,
+        /// Frames in all.
+        total: usize,
+        /// The folder.
+        out: PathBuf,
+    },
     /// A folder that could not be made.
     #[error("cannot make folder {}: {source}", path.display())]
     Folder {
@@ -148,6 +212,9 @@ pub enum Error {
     /// The phases of a grating.
     #[error("no phases: {0}")]
     Phase(#[from] daic_correlate::phase::PhaseError),
+    /// A series of images.
+    #[error(transparent)]
+    Sequence(#[from] daic_correlate::SequenceError),
     /// The two views.
     #[error("the two first-order views were not found: {0}")]
     Views(#[from] daic_correlate::ViewsError),
@@ -251,9 +318,10 @@ pub enum Error {
 }
 
 impl Error {
-    /// Exit code of the program: 2 for input, 3 for the rig.
+    /// Exit code of the program: 2 for input, 3 for the rig, 130 after an interruption.
     pub fn exit_code(&self) -> u8 {
         match self {
+            Self::Interrupted { .. } => 130,
             Self::Rig(error) if !error.is_input() => 3,
             #[cfg(feature = "sim")]
             Self::Sim(daic_hil_sim::SimError::Config(_)) => 2,

@@ -11,6 +11,7 @@
 //! * [`pair`]: plain 2D-DIC of two images; [`strain`] and [`probe`] work on its results, [`noise_floor`]
 //!   says what such a measurement can resolve.
 //! * [`phase`]: phases of gratings and displacements from them.
+//! * [`sequence`]: the same of a series of images.
 
 #[cfg(feature = "sim")]
 pub mod demo;
@@ -19,6 +20,7 @@ pub mod error;
 pub mod expand;
 mod figures;
 pub mod folder_camera;
+pub mod frames;
 pub mod images;
 pub mod measure;
 pub mod noise_floor;
@@ -31,6 +33,7 @@ pub mod progress;
 pub mod recording;
 pub mod reports;
 pub mod result_file;
+pub mod sequence;
 pub mod settings;
 #[cfg(feature = "sim")]
 pub mod simulated;

@@ -4,7 +4,9 @@ use crate::error::Error;
 use crate::measure::{Rectangle, image_of};
 use crate::progress::Progress;
 use crate::usage::{Clock, Seconds};
-use daic_correlate::{Guess, Observer, Point, Points, Reference, Roi, Settings, Stage, Target};
+use daic_correlate::{
+    EulerianPoint, Guess, Observer, Point, Points, Reference, Roi, Settings, Stage, Target,
+};
 use daic_dataset::{Column, GreyImage, Table};
 use std::sync::Mutex;
 
@@ -13,6 +15,8 @@ use std::sync::Mutex;
 pub struct PairResult {
     /// One entry per point of interest, row by row.
     pub points: Vec<Point>,
+    /// Where they were laid out.
+    pub layout: Points,
     /// Images to coefficients and gradients.
     pub prepare: Seconds,
     /// First displacements.
@@ -29,12 +33,21 @@ impl PairResult {
         self.points.iter().filter(|p| p.status.is_ok()).count()
     }
 
-    /// See [`point_table`].
+    /// [`table`] of the points.
     ///
     /// # Errors
     /// Only if two columns had one name.
     pub fn table(&self) -> Result<Table, Error> {
-        point_table(&self.points)
+        table(&self.points)
+    }
+
+    /// [`eulerian_table`] at the same positions of the deformed image.
+    ///
+    /// # Errors
+    /// Only if two columns had one name.
+    pub fn eulerian_table(&self) -> Result<Table, Error> {
+        let field = daic_correlate::eulerian(&self.layout, &self.points, self.layout.positions());
+        eulerian_table(&self.layout, &self.points, &field)
     }
 }
 
@@ -42,10 +55,50 @@ impl PairResult {
 ///
 /// # Errors
 /// Only if two columns had one name.
-pub fn point_table(points: &[Point]) -> Result<Table, Error> {
+pub fn table(points: &[Point]) -> Result<Table, Error> {
+    let status = points.iter().map(|p| p.status.name().to_owned()).collect();
+    with_status(points, status)
+}
+
+/// The same columns for positions in the deformed image; ZNCC and iterations are those of the point
+/// nearest to the material, the status is `ok` or `no_material`.
+///
+/// # Errors
+/// Only if two columns had one name.
+pub fn eulerian_table(
+    layout: &Points,
+    points: &[Point],
+    field: &[Option<EulerianPoint>],
+) -> Result<Table, Error> {
+    let rows: Vec<Point> = layout
+        .positions()
+        .iter()
+        .zip(field)
+        .zip(points)
+        .map(|((&[x, y], found), point)| match found {
+            Some(e) => {
+                Point { x, y, u: e.u, v: e.v, sigma_u: e.sigma_u, sigma_v: e.sigma_v, ..points[e.nearest] }
+            }
+            None => Point {
+                x,
+                y,
+                u: f64::NAN,
+                v: f64::NAN,
+                sigma_u: f32::NAN,
+                sigma_v: f32::NAN,
+                zncc: f32::NAN,
+                iterations: 0,
+                ..*point
+            },
+        })
+        .collect();
+    let status = field.iter().map(|e| if e.is_some() { "ok" } else { "no_material" }.to_owned()).collect();
+    with_status(&rows, status)
+}
+
+fn with_status(points: &[Point], status: Vec<String>) -> Result<Table, Error> {
     let column = |f: &dyn Fn(&Point) -> f64| Column::F64(points.iter().map(f).collect());
     let iterations = points.iter().map(|p| i64::from(p.iterations)).collect();
-    let status = points.iter().map(|p| p.status.name().to_owned()).collect();
     Ok(Table::new()
         .with("x", column(&|p| p.x))?
         .with("y", column(&|p| p.y))?
@@ -112,6 +165,7 @@ pub fn correlate(
     let between = |from: Seconds, to: Seconds| Seconds { cpu: to.cpu - from.cpu, wall: to.wall - from.wall };
     Ok(PairResult {
         points: found.points,
+        layout: points,
         prepare,
         init: between(prepare, begin),
         solve: between(begin, total),

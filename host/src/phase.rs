@@ -3,7 +3,7 @@
 use crate::error::Error;
 use crate::figures;
 use crate::measure::{Spread, image_of, spread};
-use crate::pair::point_table;
+use crate::pair::table;
 use daic_correlate::phase::{PhaseField, PhaseMaps, PhasePair, PhaseSettings, phase_maps};
 use daic_correlate::{Point, Points, Roi};
 use daic_dataset::{Column, FloatMap, GreyImage, MapAxes, Table, map};
@@ -251,5 +251,5 @@ pub fn write_displacement(folder: &Path, found: &PhaseDisplacement) -> Result<()
         figures::write_map_svg(&folder.join(format!("{}.svg", map.name)), map, title, &map.name)?;
     }
     map::write_maps_npz(&folder.join("displacement.npz"), &maps)?;
-    Ok(point_table(&found.points)?.write_csv(&folder.join("points.csv"))?)
+    Ok(table(&found.points)?.write_csv(&folder.join("points.csv"))?)
 }

@@ -33,7 +33,7 @@ pub enum Command {
     Run(RunArgs),
     /// Measure everything in a recorded dataset; takes up where it was interrupted
     Process(ProcessArgs),
-    /// Correlate two images (2D-DIC)
+    /// Correlate two images or a series (2D-DIC); takes up a series that was interrupted
     Correlate(CorrelateArgs),
     /// Strain from the points of `daic correlate`
     Strain(StrainArgs),
@@ -124,14 +124,24 @@ pub struct ProcessArgs {
 pub struct CorrelateArgs {
     /// Reference image (8 or 16 bit TIFF, PNG, BMP)
     pub reference: PathBuf,
-    /// Deformed image
-    pub deformed: PathBuf,
+    /// Deformed images in order: files, folders or 'patterns'; with more than one, --out is a folder
+    #[arg(required = true)]
+    pub deformed: Vec<PathBuf>,
     #[command(flatten)]
     pub dic: DicArgs,
+    /// Which image a series is correlated with; displacements always count from the first
+    #[arg(long = "reference", value_name = "WHICH")]
+    pub update: Option<UpdateArg>,
+    /// Where displacements are stated
+    #[arg(long, default_value = "lagrangian")]
+    pub description: DescriptionArg,
+    /// Replace the results of another run in the folder
+    #[arg(long)]
+    pub overwrite: bool,
     /// Region of interest in pixels: X,Y,WIDTH,HEIGHT
     #[arg(long, value_name = "X,Y,W,H", value_parser = parse_roi, allow_hyphen_values = true)]
     pub roi: Option<Roi>,
-    /// Points to this file (.csv or .npz)
+    /// Points to this file (.csv or .npz); of a series, to this folder
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
 }
@@ -215,6 +225,43 @@ pub enum ShapeArg {
 pub enum InterpolationArg {
     Cubic,
     Quintic,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum UpdateArg {
+    /// The first, always
+    Fixed,
+    /// The one before
+    Incremental,
+    /// The first, until a frame is recognised badly; then the last good one
+    Auto,
+}
+
+impl From<UpdateArg> for daic_correlate::Update {
+    fn from(update: UpdateArg) -> Self {
+        match update {
+            UpdateArg::Fixed => Self::Fixed,
+            UpdateArg::Incremental => Self::Incremental,
+            UpdateArg::Auto => Self::AUTOMATIC,
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum DescriptionArg {
+    /// At the material's position in the first image
+    Lagrangian,
+    /// At the material's position in the deformed image
+    Eulerian,
+}
+
+impl From<DescriptionArg> for daic::sequence::Description {
+    fn from(description: DescriptionArg) -> Self {
+        match description {
+            DescriptionArg::Lagrangian => Self::Lagrangian,
+            DescriptionArg::Eulerian => Self::Eulerian,
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]

@@ -2,14 +2,15 @@
 
 use super::arguments::{
     CorrelateArgs, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, GratingsArg, InitArgs,
-    InterpolationArg, PhaseArgs, ProcessArgs, ProfileArgs, Roi, RunArgs, ShapeArg, WindowArg,
+    InterpolationArg, PhaseArgs, ProcessArgs, ProfileArgs, Roi, RunArgs, ShapeArg, UpdateArg, WindowArg,
 };
 #[cfg(feature = "sim")]
 use super::arguments::{DemoArgs, SimulateArgs};
 use super::output::{Answer, Output};
 use daic::measure::{self, Rectangle, Reference};
+use daic::sequence::{self, Description};
 use daic::{
-    Error, Progress as _, doctor as checks, images, optics_section, pair, phase as gratings,
+    Error, Progress as _, doctor as checks, frames, images, optics_section, pair, phase as gratings,
     process as processing, reports,
 };
 use daic_dataset::{Existing, GreyImage, atomic};
@@ -58,7 +59,7 @@ pub fn simulate(arguments: &SimulateArgs, output: &Output) -> Result<Answer, Err
     if let Some(seed) = arguments.seed {
         experiment.seed = seed;
     }
-    output.stop_rig_on_interrupt();
+    output.stop_on_interrupt();
     let existing = if arguments.replace { Existing::Replace } else { Existing::Refuse };
     let recorded =
         daic::demo::simulate(&experiment, arguments.scene.as_deref(), &arguments.out, existing, output)?;
@@ -67,7 +68,7 @@ pub fn simulate(arguments: &SimulateArgs, output: &Output) -> Result<Answer, Err
 
 pub fn run(arguments: &RunArgs, output: &Output) -> Result<Answer, Error> {
     let experiment = Experiment::load(&arguments.experiment)?;
-    output.stop_rig_on_interrupt();
+    output.stop_on_interrupt();
     let port = arguments.port.clone().unwrap_or_else(|| experiment.rig.port.clone());
     let frames = match (&arguments.frames, &experiment.rig.camera.source) {
         (Some(folder), _) | (None, experiment::CameraSource::Folder(folder)) => folder.clone(),
@@ -114,14 +115,21 @@ pub fn process(arguments: &ProcessArgs, output: &Output) -> Result<Answer, Error
 }
 
 pub fn correlate(arguments: &CorrelateArgs, output: &Output) -> Result<Answer, Error> {
-    let (reference, deformed) = images::read_pair(&arguments.reference, &arguments.deformed)?;
+    let one = match arguments.deformed.as_slice() {
+        [one] if !frames::is_many(one) && arguments.update.is_none() && !arguments.overwrite => one,
+        _ => return correlate_sequence(arguments, output),
+    };
+    let (reference, deformed) = images::read_pair(&arguments.reference, one)?;
     let roi = arguments.roi.map(|roi| rectangle(roi, &reference)).transpose()?;
     let writer = arguments.out.as_deref().map(table_writer).transpose()?;
     let mut dic = daic_correlate::Settings::default();
     let mut step = 5;
     apply(&arguments.dic, &mut dic, &mut step);
     let found = pair::correlate(&reference, &deformed, &dic, step, roi, output)?;
-    let table = found.table()?;
+    let table = match arguments.description.into() {
+        Description::Lagrangian => found.table()?,
+        Description::Eulerian => found.eulerian_table()?,
+    };
     if let (Some(path), Some(write)) = (&arguments.out, writer) {
         write(&table, path)?;
     }
@@ -149,6 +157,50 @@ pub fn correlate(arguments: &CorrelateArgs, output: &Output) -> Result<Answer, E
         v.std
     );
     Ok(Answer::new(json, text))
+}
+
+fn correlate_sequence(arguments: &CorrelateArgs, output: &Output) -> Result<Answer, Error> {
+    let frames = frames::expand(&arguments.deformed, &arguments.reference)?;
+    let Some(out) = &arguments.out else {
+        return Err(Error::NoFolder { frames: frames.len(), reference: arguments.reference.clone() });
+    };
+    let roi = match arguments.roi {
+        Some(roi) => Some(rectangle(roi, &images::read(&arguments.reference)?)?),
+        None => None,
+    };
+    let mut settings = daic_correlate::Settings::default();
+    let mut step = 5;
+    apply(&arguments.dic, &mut settings, &mut step);
+    let options = sequence::Options {
+        reference: arguments.reference.clone(),
+        frames,
+        settings,
+        step,
+        roi,
+        update: arguments.update.unwrap_or(UpdateArg::Fixed).into(),
+        description: arguments.description.into(),
+        out: out.clone(),
+        overwrite: arguments.overwrite,
+    };
+    output.stop_on_interrupt();
+    let done = sequence::correlate(&options, output)?;
+    let mut text = String::new();
+    for f in &done.summary.frames {
+        let (name, ok, all) = (&f.file, f.converged, f.points);
+        if let Some(reason) = &f.failed {
+            writeln!(text, "{name}: left out: {reason}").ok();
+            continue;
+        }
+        let px = |v: Option<f64>| v.map_or("-".to_owned(), |v| format!("{v:.4}"));
+        let [u, su, v, sv] = [f.mean_u_px, f.std_u_px, f.mean_v_px, f.std_v_px].map(px);
+        writeln!(text, "{name}: {ok} of {all} points, u {u} ± {su} px, v {v} ± {sv} px").ok();
+    }
+    let (resumed, failed) = (done.resumed, done.summary.failed);
+    writeln!(text, "{resumed} frames were there already, {failed} left out; results: {}", out.display()).ok();
+    let mut json = as_json(&done.summary)?;
+    json["resumed"] = resumed.into();
+    json["out"] = out.display().to_string().into();
+    Ok(Answer::new(json, text).checked(failed == 0))
 }
 
 pub fn phase(arguments: &PhaseArgs, output: &Output) -> Result<Answer, Error> {

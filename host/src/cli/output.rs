@@ -61,8 +61,8 @@ impl Output {
         .ok();
     }
 
-    /// While a rig runs, Ctrl-C stops it in an orderly way; a second one ends the program at once.
-    pub fn stop_rig_on_interrupt(&self) {
+    /// Ctrl-C stops a rig or a series of images in an orderly way; a second one ends the program at once.
+    pub fn stop_on_interrupt(&self) {
         #[cfg(unix)]
         for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
             // in this order: the first interrupt finds the flag still down

@@ -7,8 +7,8 @@ use crate::point::{Point, ShapeParameters, SolvedBy, Status};
 use crate::points::Points;
 use crate::prepared::{Reference, Target};
 use crate::propagate::Propagation;
-use crate::simd::dispatch;
 use crate::settings::{Interpolation, Settings, SettingsError, SolverChoice};
+use crate::simd::dispatch;
 use fearless_simd::{Level, Simd};
 use std::time::{Duration, Instant};
 use thiserror::Error;
@@ -30,6 +30,10 @@ pub enum Guess<'a> {
     /// A displacement (u, v) for every point, good to about two pixels. Points with `None`, and
     /// those that fail from their guess, are reached from their neighbours.
     Given(&'a [Option<[f64; 2]>]),
+    /// Displacement and derivatives at every point, as the frame before left them. Where more than
+    /// half of them fail the frame has moved on too far, and the default guess is used instead;
+    /// otherwise points with `None`, and those that fail, are reached from their neighbours.
+    Shapes(&'a [Option<ShapeParameters>]),
 }
 
 /// Stage of a run.
@@ -199,8 +203,12 @@ impl Workspace {
         let few = points.selected(&sparse.points);
         let quiet = Quiet(observer);
         let mut first = Propagation::new(&solver_sparse, &few, &quiet);
-        let guesses = few_guesses(guess, &sparse.points);
-        let guess_sparse = guesses.as_deref().map_or(*guess, Guess::Given);
+        let (given, shapes) = few_guesses(guess, &sparse.points);
+        let guess_sparse = match guess {
+            Guess::Given(_) => Guess::Given(&given),
+            Guess::Shapes(_) => Guess::Shapes(&shapes),
+            other => *other,
+        };
         let seeds = first.start(&guess_sparse);
         first.finish(seeds, &guess_sparse);
         let init = start.elapsed();
@@ -227,10 +235,12 @@ impl Observer for Quiet<'_> {
     }
 }
 
-fn few_guesses(guess: &Guess<'_>, few: &[usize]) -> Option<Vec<Option<[f64; 2]>>> {
+/// Guesses of the chosen points, where there is one for every point.
+fn few_guesses(guess: &Guess<'_>, few: &[usize]) -> (Vec<Option<[f64; 2]>>, Vec<Option<ShapeParameters>>) {
     match guess {
-        Guess::Given(list) => Some(few.iter().map(|&k| list[k]).collect()),
-        _ => None,
+        Guess::Given(list) => (few.iter().map(|&k| list[k]).collect(), Vec::new()),
+        Guess::Shapes(list) => (Vec::new(), few.iter().map(|&k| list[k]).collect()),
+        _ => (Vec::new(), Vec::new()),
     }
 }
 
@@ -344,6 +354,15 @@ fn check(
                 return Err(CorrelateError::GuessValue { index, limit: LIMIT });
             }
         }
+        Guess::Shapes(list) => {
+            if list.len() != points.len() {
+                return Err(CorrelateError::GuessCount { guesses: list.len(), points: points.len() });
+            }
+            let all = |s: &ShapeParameters| s.u.iter().chain(&s.v).all(|&c| usable(f64::from(c)));
+            if let Some(index) = list.iter().position(|g| g.as_ref().is_some_and(|s| !all(s))) {
+                return Err(CorrelateError::GuessValue { index, limit: LIMIT });
+            }
+        }
     }
     Ok(())
 }
@@ -376,7 +395,6 @@ fn point(points: &Points, k: usize, outcome: Option<&Outcome>) -> Point {
     let (_, offset) = points.centre(k);
     [p.u, p.v] = o.warp.at(offset[0], offset[1]);
     [p.sigma_u, p.sigma_v] = o.sigma;
-    let derivatives = |c: &[f64; 6]| [c[0], c[1], c[2], 2.0 * c[3], c[4], 2.0 * c[5]].map(|d| d as f32);
-    p.shape = ShapeParameters { u: derivatives(&o.warp.0[0]), v: derivatives(&o.warp.0[1]) };
+    p.shape = o.warp.parameters();
     p
 }

@@ -10,8 +10,8 @@ use crate::prepared::{Reference, Target};
 use crate::scalar;
 use crate::settings::{Interpolation, Settings};
 use crate::shape::{Shape, Warp};
-use crate::subset::{Layout, Subset};
 use crate::simd::dispatch;
+use crate::subset::{Layout, Subset};
 use fearless_simd::{Level, prelude::*};
 use fearless_simd_macros::simd;
 

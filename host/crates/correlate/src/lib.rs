@@ -14,6 +14,7 @@
 mod consistency;
 mod correlate;
 mod dense;
+mod eulerian;
 mod fft;
 mod icgn;
 mod image;
@@ -28,6 +29,7 @@ mod prepared;
 mod propagate;
 mod sampler;
 mod scalar;
+mod sequence;
 mod settings;
 mod shape;
 mod simd;
@@ -39,10 +41,12 @@ pub use correlate::{
     CorrelateError, Correlation, Guess, Observer, Stage, Timing, Workspace, correlate, correlate_scalar,
     simd_level,
 };
+pub use eulerian::{EulerianPoint, eulerian};
 pub use image::{Image, ImageError, Mask};
 pub use point::{Point, ShapeParameters, SolvedBy, Status};
 pub use points::{Grid, Points, PointsError, Rectangle, Roi};
 pub use prepared::{Reference, Target};
+pub use sequence::{Sequence, SequenceError, SequenceFrame, SequenceState, Update};
 pub use settings::{Criterion, Interpolation, Settings, SettingsError, SolverChoice};
 pub use shape::Shape;
 pub use views::{View, Views, ViewsError, find_views};

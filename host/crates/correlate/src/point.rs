@@ -104,7 +104,7 @@ impl fmt::Display for Status {
 
 /// Displacement and its derivatives at the centre pixel of the subset; lengths in pixels, index
 /// 0…5: value, ∂x, ∂y, ∂²x, ∂x∂y, ∂²y. What the shape function does not have is zero.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ShapeParameters {
     /// u, u_x, u_y, u_xx, u_xy, u_yy.
     pub u: [f32; 6],

@@ -62,6 +62,12 @@ impl Reference {
         );
     }
 
+    /// Exchanges the image for another, which gets the old one; no memory is allocated.
+    pub(crate) fn exchange(&mut self, image: &mut Image) {
+        std::mem::swap(&mut self.image, image);
+        self.prepare();
+    }
+
     /// The image.
     pub fn image(&self) -> &Image {
         &self.image

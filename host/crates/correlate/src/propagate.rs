@@ -8,7 +8,7 @@
 use crate::correlate::{Guess, Observer};
 use crate::fft::{Search, Window, global_shifts};
 use crate::icgn::{Outcome, Scratch, Solver};
-use crate::point::{SolvedBy, Status};
+use crate::point::{ShapeParameters, SolvedBy, Status};
 use crate::points::Points;
 use crate::shape::Warp;
 use rayon::prelude::*;
@@ -66,6 +66,7 @@ impl<'a> Propagation<'a> {
                     .collect();
                 self.solve(&tasks)
             }
+            Guess::Shapes(list) => self.start_from(list),
             Guess::Search { u, v } => {
                 let window = Window {
                     u: (u.0.floor() as i32, u.1.ceil() as i32),
@@ -90,6 +91,41 @@ impl<'a> Propagation<'a> {
                 self.search(&few, &[whole])
             }
         }
+    }
+
+    /// Every point from its own displacement and derivatives.
+    fn start_from(&mut self, list: &[Option<ShapeParameters>]) -> Vec<usize> {
+        let tasks: Vec<Task> = list
+            .iter()
+            .enumerate()
+            .filter_map(|(point, shape)| {
+                let (_, offset) = self.points.centre(point);
+                let warp = Warp::of(shape.as_ref()?).moved(-offset[0], -offset[1]);
+                Some(Task { point, warp })
+            })
+            .collect();
+        let found = self.solve(&tasks);
+        if found.is_empty() || 2 * found.len() < tasks.len() {
+            self.outcomes.fill(None);
+            self.done = 0;
+            return self.start(&Guess::default());
+        }
+        // neighbours may have a better idea of the points that failed
+        for o in &mut self.outcomes {
+            if o.is_some_and(|o| {
+                !matches!(o.status, Status::Converged | Status::LowTexture | Status::Singular)
+            }) {
+                *o = None;
+                self.done -= 1;
+            }
+        }
+        let middle = |c: usize| {
+            let mut values: Vec<f64> = tasks.iter().map(|t| t.warp.0[c][0]).collect();
+            let half = values.len() / 2;
+            *values.select_nth_unstable_by(half, f64::total_cmp).1
+        };
+        self.globals = vec![[middle(0), middle(1)]];
+        found
     }
 
     fn local_windows(&self) -> Vec<Window> {
@@ -275,7 +311,12 @@ impl<'a> Propagation<'a> {
     }
 
     /// Solves what the dense form has left: first the points for which it proposes a start.
-    pub(crate) fn complete(&mut self, proposals: &[(usize, Warp)], guess: &Guess<'_>, sparse: Propagation<'_>) {
+    pub(crate) fn complete(
+        &mut self,
+        proposals: &[(usize, Warp)],
+        guess: &Guess<'_>,
+        sparse: Propagation<'_>,
+    ) {
         self.globals = sparse.globals;
         self.done = self.outcomes.iter().filter(|o| o.is_some()).count();
         let tasks: Vec<Task> = proposals.iter().map(|&(point, warp)| Task { point, warp }).collect();

@@ -135,14 +135,7 @@ impl Dense {
         let buffers = &self.buffers;
         self.shares.par_iter_mut().for_each(|share| {
             with(buffers, |b| {
-                share.prepared.fill(
-                    solver.level,
-                    &tiling,
-                    &share.task,
-                    solver.reference,
-                    order,
-                    &mut b.sums,
-                )
+                share.prepared.fill(solver.level, &tiling, &share.task, solver.reference, order, &mut b.sums)
             });
         });
         true

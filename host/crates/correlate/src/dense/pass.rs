@@ -353,7 +353,14 @@ fn increments<S: Simd, const O: usize>(
 /// Largest difference between eight subsets' polynomials and the field, over the nodes next to the
 /// subset's corners and the middles of its sides.
 #[inline(always)]
-fn distance<S: Simd, const O: usize>(s: S, pass: &Pass<'_>, task: &Task, j: usize, k: usize, out: &mut [f32]) {
+fn distance<S: Simd, const O: usize>(
+    s: S,
+    pass: &Pass<'_>,
+    task: &Task,
+    j: usize,
+    k: usize,
+    out: &mut [f32],
+) {
     let tiling = pass.tiling;
     let m = moments(O);
     let e = tiling.margin();
