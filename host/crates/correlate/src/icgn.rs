@@ -149,6 +149,19 @@ impl<'a> Solver<'a> {
         let r = self.layout.radius as f64;
         let w = self.target.image.width() as f64 - 1.0 + margin;
         let h = self.target.image.height() as f64 - 1.0 + margin;
+        // most subsets are far from every edge
+        let reach = |c: &[f64; 6]| {
+            let [_, a, b, d, e, f] = c.map(f64::abs);
+            r * (1.0 + a + b + r * (d + e + f))
+        };
+        let place = |p: i32, d: f64, reach: f64, size: f64| {
+            let p = f64::from(p) + d;
+            p - reach >= -margin && p + reach <= size
+        };
+        let [u, v] = &warp.0;
+        if place(x, u[0], reach(u), w) && place(y, v[0], reach(v), h) {
+            return true;
+        }
         [-r, 0.0, r].iter().all(|&eta| {
             [-r, 0.0, r].iter().all(|&xi| {
                 let d = warp.at(xi, eta);

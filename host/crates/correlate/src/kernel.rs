@@ -276,10 +276,9 @@ mod tests {
     fn compare(radius: usize, gradient: f64, order: usize, taps: usize) {
         let kind = if taps == 6 { Interpolation::Quintic } else { Interpolation::Cubic };
         let reference = Reference::new(texture());
-        let mut plane = Plane::default();
-        plane.load(reference.image(), 100.0);
+        let (mut between, mut plane) = (Plane::default(), Plane::default());
         let level = Level::new();
-        plane::coefficients(level, &mut plane, kind);
+        plane::coefficients(level, reference.image(), 100.0, kind, &mut between, &mut plane);
         let layout = Layout::new(radius);
         let (x, y) = (55, 52);
         let second = if order == 2 { gradient / 100.0 } else { 0.0 };
@@ -362,9 +361,8 @@ mod tests {
         let grey = (0..w * h).map(|k| f((k % w) as f64, (k / w) as f64) as f32).collect();
         let image = Image::from_f32(w, h, grey).unwrap();
         for (kind, taps) in [(Interpolation::Cubic, 4), (Interpolation::Quintic, 6)] {
-            let mut plane = Plane::default();
-            plane.load(&image, 0.0);
-            plane::coefficients(Level::new(), &mut plane, kind);
+            let (mut between, mut plane) = (Plane::default(), Plane::default());
+            plane::coefficients(Level::new(), &image, 0.0, kind, &mut between, &mut plane);
             for k in 0..50 {
                 let (x, y) = (60.0 + 0.83 * f64::from(k), 60.0 + 0.57 * f64::from(k));
                 let g = scalar::sample(&plane, taps, x, y);

@@ -29,6 +29,8 @@ pub struct Target {
     /// Subtracted before the coefficients were made, so that single precision is not spent on it.
     pub(crate) offset: f32,
     pub(crate) interpolation: Interpolation,
+    /// Memory for the work.
+    between: Plane,
 }
 
 impl Reference {
@@ -51,14 +53,8 @@ impl Reference {
         let (level, mean) = (Level::new(), self.mean);
         let Self { image, gx, gy, .. } = self;
         rayon::join(
-            || {
-                gx.load(image, mean);
-                plane::gradient_x(level, gx);
-            },
-            || {
-                gy.load(image, mean);
-                plane::gradient_y(level, gy);
-            },
+            || plane::gradient_x(level, image, mean, gx),
+            || plane::gradient_y(level, image, mean, gy),
         );
     }
 
@@ -77,7 +73,13 @@ impl Reference {
 impl Target {
     /// Prepares a deformed image for the given interpolation.
     pub fn new(image: Image, interpolation: Interpolation) -> Self {
-        let mut target = Self { offset: 0.0, coefficients: Plane::default(), interpolation, image };
+        let mut target = Self {
+            offset: 0.0,
+            coefficients: Plane::default(),
+            interpolation,
+            image,
+            between: Plane::default(),
+        };
         target.prepare();
         target
     }
@@ -90,8 +92,8 @@ impl Target {
 
     fn prepare(&mut self) {
         self.offset = self.image.mean();
-        self.coefficients.load(&self.image, self.offset);
-        plane::coefficients(Level::new(), &mut self.coefficients, self.interpolation);
+        let Self { image, offset, between, coefficients, interpolation } = self;
+        plane::coefficients(Level::new(), image, *offset, *interpolation, between, coefficients);
     }
 
     /// The image.

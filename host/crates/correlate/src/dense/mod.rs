@@ -326,25 +326,43 @@ impl Dense {
         let Some(grid) = points.as_grid() else {
             return Vec::new();
         };
-        let mut proposals = Vec::new();
-        for share in &self.shares {
-            let t = &share.task;
-            for row in 0..t.rows {
-                for column in 0..t.columns {
-                    let (i, j) = (self.first.0 + t.column + column, self.first.1 + t.row + row);
-                    let Some(k) = grid.point(i, j) else {
+        // a grid row's points follow each other
+        let mut rows = Vec::with_capacity(tiling.rows);
+        let mut rest = outcomes;
+        let mut done = 0;
+        for j in 0..tiling.rows {
+            let of_row = |i: &usize| grid.point(self.first.0 + i, self.first.1 + j);
+            let Some(first) = (0..tiling.columns).find_map(|i| of_row(&i)) else {
+                continue;
+            };
+            let last = (0..tiling.columns).rev().find_map(|i| of_row(&i)).unwrap_or(first);
+            let (row, after) = rest.split_at_mut(first - done).1.split_at_mut(last + 1 - first);
+            rows.push((j, first, row));
+            rest = after;
+            done = last + 1;
+        }
+        let (columns, task_rows) = self.shares.first().map_or((1, 1), |s| (s.task.columns, s.task.rows));
+        let across = tiling.columns.div_ceil(columns);
+        let left: Vec<Vec<(usize, Warp)>> = rows
+            .into_par_iter()
+            .map(|(j, first, row)| {
+                let mut proposals = Vec::new();
+                for i in 0..tiling.columns {
+                    let Some(k) = grid.point(self.first.0 + i, self.first.1 + j) else {
                         continue;
                     };
-                    let (outcome, warp) = self.outcome(solver, tiling, share, order, column, row);
-                    match (outcome, warp) {
-                        (Some(o), _) => outcomes[k] = Some(o),
+                    let share = &self.shares[j / task_rows * across + i / columns];
+                    let (column, line) = (i - share.task.column, j - share.task.row);
+                    match self.outcome(solver, tiling, share, order, column, line) {
+                        (Some(o), _) => row[k - first] = Some(o),
                         (None, Some(w)) => proposals.push((k, w)),
                         (None, None) => {}
                     }
                 }
-            }
-        }
-        proposals
+                proposals
+            })
+            .collect();
+        left.into_iter().flatten().collect()
     }
 
     #[inline(always)]
