@@ -9,6 +9,16 @@ pub enum Error {
     /// An experiment or optics file.
     #[error(transparent)]
     Config(#[from] daic_rig::experiment::ConfigError),
+    /// A frame of another size than the ones before it.
+    #[error(
+        "the frame has {}×{} pixels, the frames before it {}×{}", found.0, found.1, expected.0, expected.1
+    )]
+    FrameSize {
+        /// Columns and rows.
+        found: (usize, usize),
+        /// Columns and rows of the first frame.
+        expected: (usize, usize),
+    },
     /// Optics that no set-up can have.
     #[error("the optics cannot be used: {0}")]
     Optics(#[from] daic_optics::OpticsError),

@@ -86,6 +86,8 @@ pub struct Reference {
     settings: Settings,
     /// The −1 view found.
     pub minus: Rectangle,
+    /// Its pixels.
+    pub(super) minus_mask: daic_correlate::Mask,
     /// The +1 view found.
     pub plus: Rectangle,
     /// Where the points stand.
@@ -119,7 +121,7 @@ pub fn image_of(frame: &GreyImage) -> Result<Image, Error> {
     Ok(Image::from_u16(frame.width as usize, frame.height as usize, &frame.data)?)
 }
 
-fn displaced(point: &Point) -> [f64; 2] {
+pub(super) fn displaced(point: &Point) -> [f64; 2] {
     [point.x + point.u, point.y + point.v]
 }
 
@@ -127,7 +129,7 @@ fn sigma(point: &Point) -> [f64; 2] {
     [f64::from(point.sigma_u), f64::from(point.sigma_v)]
 }
 
-fn grid_of(points: &Points) -> Grid {
+pub(super) fn grid_of(points: &Points) -> Grid {
     let Some(grid) = points.as_grid() else {
         return Grid::none();
     };
@@ -178,6 +180,7 @@ impl Reference {
             points,
             settings: settings.clone(),
             minus: found.minus.bounds,
+            minus_mask: found.minus.mask,
             plus: found.plus.bounds,
             matches,
         })
@@ -252,7 +255,7 @@ fn centres(view: &Rectangle, radius: usize) -> Option<Rectangle> {
     (width > 0 && height > 0).then_some(Rectangle { x: view.x + left, y: view.y + top, width, height })
 }
 
-fn match_of(point: &Point) -> Match {
+pub(super) fn match_of(point: &Point) -> Match {
     let ok = point.status.is_ok();
     Match {
         pair: PixelPair {

@@ -6,6 +6,7 @@
 
 mod decode;
 mod files;
+mod live;
 mod matching;
 mod statistics;
 
@@ -13,6 +14,7 @@ pub use decode::{Displacement, DisplacementPoint, Profile, ProfilePoint, displac
 pub use files::{
     displacement_maps, displacement_table, height_map, profile_table, write_displacement, write_profile,
 };
+pub use live::Live;
 pub use matching::{Match, Rectangle, Reference, Settings, Track, Tracks, image_of};
 pub use statistics::{Plane, Spread, plane_of, spread};
 
@@ -88,6 +90,13 @@ impl Grid {
     /// No nodes: for points that need no map.
     pub const fn none() -> Self {
         Self { x0: 0, y0: 0, step: 1, columns: 0, rows: 0, nodes: Vec::new() }
+    }
+
+    /// The same nodes in an image of which the points' image is the part from pixel (x, y) on.
+    pub(crate) fn moved(mut self, x: usize, y: usize) -> Self {
+        self.x0 += x;
+        self.y0 += y;
+        self
     }
 
     /// Values of points, spread over the nodes; NaN at nodes without a point.

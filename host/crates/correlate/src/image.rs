@@ -101,6 +101,34 @@ impl Image {
         Ok(Self { width, height, data: grey })
     }
 
+    /// Replaces the image by a window of a larger one, using the memory again: `width` × `height`
+    /// pixels, rows `stride` values apart, the first at `grey[0]`.
+    ///
+    /// # Errors
+    /// As [`Image::from_u8`]; [`ImageError::Length`] also where the rows do not fit into `grey`. The
+    /// image is unchanged then.
+    pub fn assign<T: Copy + Into<f32>>(
+        &mut self,
+        width: usize,
+        height: usize,
+        stride: usize,
+        grey: &[T],
+    ) -> Result<(), ImageError> {
+        check(width, height, width.saturating_mul(height))?;
+        let needed = stride.saturating_mul(height - 1).saturating_add(width);
+        if stride < width || grey.len() < needed {
+            return Err(ImageError::Length { width, height, found: grey.len() });
+        }
+        (self.width, self.height) = (width, height);
+        self.data.resize(width * height, 0.0);
+        for (out, row) in self.data.chunks_exact_mut(width).zip(grey.chunks(stride)) {
+            for (o, g) in out.iter_mut().zip(row) {
+                *o = (*g).into();
+            }
+        }
+        Ok(())
+    }
+
     /// Columns.
     pub fn width(&self) -> usize {
         self.width

@@ -1,6 +1,6 @@
 //! Images made ready for correlation; kept and reused over a series.
 
-use crate::image::Image;
+use crate::image::{Image, ImageError};
 use crate::plane::{self, Plane};
 use crate::settings::Interpolation;
 use fearless_simd::Level;
@@ -47,6 +47,23 @@ impl Reference {
         self.prepare();
     }
 
+    /// Replaces the image by a window of a larger one, as [`Image::assign`]: no memory is taken where
+    /// the size stays the same.
+    ///
+    /// # Errors
+    /// As [`Image::assign`].
+    pub fn assign<T: Copy + Into<f32>>(
+        &mut self,
+        width: usize,
+        height: usize,
+        stride: usize,
+        grey: &[T],
+    ) -> Result<(), ImageError> {
+        self.image.assign(width, height, stride, grey)?;
+        self.prepare();
+        Ok(())
+    }
+
     fn prepare(&mut self) {
         self.id = IDENTITIES.fetch_add(1, Ordering::Relaxed);
         self.mean = self.image.mean();
@@ -88,6 +105,23 @@ impl Target {
     pub fn update(&mut self, image: Image) {
         self.image = image;
         self.prepare();
+    }
+
+    /// Replaces the image by a window of a larger one, as [`Image::assign`]: no memory is taken where
+    /// the size stays the same.
+    ///
+    /// # Errors
+    /// As [`Image::assign`].
+    pub fn assign<T: Copy + Into<f32>>(
+        &mut self,
+        width: usize,
+        height: usize,
+        stride: usize,
+        grey: &[T],
+    ) -> Result<(), ImageError> {
+        self.image.assign(width, height, stride, grey)?;
+        self.prepare();
+        Ok(())
     }
 
     fn prepare(&mut self) {
