@@ -375,16 +375,14 @@ fn noise_of_composed_displacements() {
                     .iter()
                     .map(|i| {
                         let grey: Vec<f64> = i.grey().iter().map(|&g| f64::from(g)).collect();
-                        image(N, N, &common::noisy(&grey, 4.0, &mut rng))
+                        image(N, N, &common::noisy(&grey, 1.5, &mut rng))
                     })
                     .collect();
                 let mut sequence = Sequence::new(noisy[0].clone(), grid.clone(), settings(), update).unwrap();
                 count += grid.len() as f64;
                 for (k, frame) in noisy.iter().enumerate().skip(1) {
                     let result = sequence.next(frame.clone(), &()).unwrap();
-                    for p in result.points.iter().filter(|p| !p.status.is_ok()) {
-                        println!("{name} {update:?} seed {seed} frame {k} {p:?}");
-                    }
+                    assert_eq!(result.converged(), grid.len());
                     for p in &result.points {
                         let e = p.u - step * k as f64;
                         seen[k][0] += e * e;
@@ -407,8 +405,9 @@ fn noise_of_composed_displacements() {
             match update {
                 // 20 seeds × 16 points: 4 % of chance
                 Update::Fixed => assert!((ratio - 1.0).abs() < 0.15, "{ratio}"),
-                // the noise of an image that is target once and reference once largely cancels
-                _ => assert!(ratio > 1.0 && ratio < 8f64.sqrt() * 1.15, "{ratio}"),
+                // The noise of an image that is target once and reference once largely cancels:
+                // independent steps would give 1, complete cancellation √8
+                _ => assert!(ratio > 1.7 && ratio < 8f64.sqrt() * 1.15, "{ratio}"),
             }
         }
     }
