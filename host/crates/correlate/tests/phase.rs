@@ -12,7 +12,7 @@ use std::f64::consts::{PI, TAU};
 const NOISE: f64 = 2.55;
 
 /// A displacement field.
-type Field = dyn Fn(f64, f64) -> [f64; 2] + Sync;
+type Field<'a> = dyn Fn(f64, f64) -> [f64; 2] + Sync + 'a;
 
 /// Profile of the lines.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -108,7 +108,7 @@ impl Grating {
     }
 
     /// Grey levels 8…247 of `n` × `n` pixels, without noise.
-    fn grey(&self, n: usize, u: &Field) -> Vec<f64> {
+    fn grey(&self, n: usize, u: &Field<'_>) -> Vec<f64> {
         let row = |y: usize| -> Vec<f64> {
             (0..n).map(|x| 8.0 + 239.0 * self.pixel(x as f64, y as f64, u)).collect()
         };
@@ -177,7 +177,7 @@ fn measured(
     sigma: f64,
     seed: u64,
     settings: &PhaseSettings,
-    truth: &Field,
+    truth: &Field<'_>,
 ) -> Errors {
     let mut rng = seeded(seed);
     let a = recorded(n, &grating.grey(n, &still), sigma, &mut rng);
@@ -204,7 +204,7 @@ fn displacement_of_noisy_gratings_is_within_a_thousandth_of_a_pixel() {
     let strain = move |x: f64, y: f64| [0.005 * (x - m), -0.0015 * (y - m)];
     let wave = |x: f64, y: f64| [0.3 * (TAU * x / 800.0).sin(), 0.2 * (TAU * y / 1000.0).cos()];
     let turn = rotation(2.0, n);
-    let cases: [(&str, &Field); 4] = [
+    let cases: [(&str, &Field<'_>); 4] = [
         ("translation", &translation),
         ("strain 0.5 %", &strain),
         ("rotation 2°", &turn),
