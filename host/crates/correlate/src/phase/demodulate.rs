@@ -2,7 +2,8 @@
 
 use super::window::Window;
 use crate::image::Image;
-use fearless_simd::{Level, dispatch, f32x8, prelude::*};
+use crate::simd::dispatch;
+use fearless_simd::{Level, f32x8, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
 

@@ -42,7 +42,7 @@ pub fn unwrap(width: usize, wrapped: &[f32], valid: &[bool]) -> Unwrapped {
 /// Pairs of valid neighbours.
 fn edges(width: usize, valid: &[bool]) -> impl Iterator<Item = (usize, usize)> + '_ {
     (0..valid.len()).filter(|&k| valid[k]).flat_map(move |k| {
-        let right = ((k + 1) % width != 0 && valid[k + 1]).then_some((k, k + 1));
+        let right = (!(k + 1).is_multiple_of(width) && valid[k + 1]).then_some((k, k + 1));
         let below = (k + width < valid.len() && valid[k + width]).then_some((k, k + width));
         right.into_iter().chain(below)
     })
@@ -73,10 +73,10 @@ fn flood(width: usize, wrapped: &[f32], valid: &[bool]) -> (Vec<f64>, Vec<u32>, 
                     stack.push(m as u32);
                 }
             };
-            if k % width > 0 {
+            if !k.is_multiple_of(width) {
                 visit(k - 1);
             }
-            if (k + 1) % width != 0 {
+            if !(k + 1).is_multiple_of(width) {
                 visit(k + 1);
             }
             if k >= width {
