@@ -6,9 +6,10 @@ use crate::icgn::{Scratch, Solver};
 use crate::kernel::{Sampling, Sums, sweep};
 use crate::plane::{self, Plane};
 use crate::scalar;
+use crate::simd::dispatch;
 use crate::subset::{Layout, Subset};
 use crate::{Image, Interpolation, Reference, Settings, Target};
-use fearless_simd::{Level, dispatch};
+use fearless_simd::Level;
 
 /// A prepared pair and one subset of it, ready for any kernel.
 pub struct Bench {

@@ -11,6 +11,7 @@ struct Series {
     reference: Reference,
     target: Target,
     points: Points,
+    workspace: Workspace,
 }
 
 struct Run {
@@ -37,7 +38,7 @@ impl Series {
             let reference = Reference::new(image(a)?);
             let target = Target::new(image(b)?, work.settings.interpolation);
             let points = work.grid(a.width, a.height)?;
-            let s = series.insert(Series { reference, target, points });
+            let s = series.insert(Series { reference, target, points, workspace: Workspace::new() });
             s.correlate(work)
         })?;
         Ok((series.ok_or("nothing was kept")?, run))
@@ -52,8 +53,10 @@ impl Series {
         })
     }
 
-    fn correlate(&self, work: &Work) -> Result<Correlation, String> {
-        correlate(&self.reference, &self.target, &self.points, &Guess::Fft, &work.settings, &())
+    fn correlate(&mut self, work: &Work) -> Result<Correlation, String> {
+        let Self { reference, target, points, workspace } = self;
+        workspace
+            .correlate(reference, target, points, &Guess::Fft, &work.settings, &())
             .map_err(|e| e.to_string())
     }
 }
