@@ -79,8 +79,13 @@ pub fn guard(update: bool) -> Outcome {
             Err(error) => Outcome::Failed(format!("{}: {error}", path.display())),
         };
     }
-    let read = std::fs::read_to_string(&path).map_err(|e| e.to_string());
-    let baseline: Value = match read.and_then(|t| serde_json::from_str(&t).map_err(|e| e.to_string())) {
+    let Ok(text) = std::fs::read_to_string(&path) else {
+        return Outcome::NotRun(format!(
+            "instruction counts were NOT COMPARED: there is no baseline {}; `cargo xtask bench guard --update` makes one",
+            path.display()
+        ));
+    };
+    let baseline: Value = match serde_json::from_str(&text) {
         Ok(baseline) => baseline,
         Err(error) => return Outcome::Failed(format!("{}: {error}", path.display())),
     };
