@@ -3,6 +3,7 @@
 //! Every step runs even when an earlier one failed, and the end names what passed, what failed
 //! and what could not be run on this machine, with the reason.
 
+mod bench;
 mod steps;
 
 use std::process::ExitCode;
@@ -15,32 +16,34 @@ cargo xtask COMMAND
   lint       formatting, clippy, documentation without warnings, cargo-deny where installed
   ci         test, then lint
   figures    draws the pictures of README and docs anew with the program itself
-  bench      prints the speed of correlation and rendering on this machine
+  bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
+             optics: speed of the decoders
+             guard [--update]: instruction counts against the baseline (or: makes a new one)
 ";
 
 fn main() -> ExitCode {
-    let mut arguments = std::env::args().skip(1);
-    let command = arguments.next().unwrap_or_default();
-    if let Some(extra) = arguments.next() {
-        eprintln!("xtask: `{extra}` was not expected\n\n{USAGE}");
-        return ExitCode::from(2);
-    }
-    let report = match command.as_str() {
-        "test" => steps::test(),
-        "lint" => steps::lint(),
-        "ci" => {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let words: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let report = match words[..] {
+        ["test"] => steps::test(),
+        ["lint"] => steps::lint(),
+        ["ci"] => {
             let mut report = steps::test();
             report.append(steps::lint());
             report
         }
-        "figures" => steps::figures(),
-        "bench" => steps::bench(),
-        "" | "help" | "--help" | "-h" => {
+        ["figures"] => steps::figures(),
+        ["bench", "correlate"] => bench::correlate(false),
+        ["bench", "correlate", "--quick"] => bench::correlate(true),
+        ["bench", "optics"] => steps::bench_optics(),
+        ["bench", "guard"] => bench::guard::step(false),
+        ["bench", "guard", "--update"] => bench::guard::step(true),
+        [] | ["help" | "--help" | "-h"] => {
             print!("{USAGE}");
             return ExitCode::SUCCESS;
         }
-        other => {
-            eprintln!("xtask: no command `{other}`\n\n{USAGE}");
+        _ => {
+            eprintln!("xtask: no command `{}`\n\n{USAGE}", words.join(" "));
             return ExitCode::from(2);
         }
     };

@@ -5,9 +5,12 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 /// What became of one step.
-enum Outcome {
+pub enum Outcome {
+    /// It did what it should.
     Passed,
+    /// It did not, and why.
     Failed(String),
+    /// It could not be run here, and why.
     NotRun(String),
 }
 
@@ -36,7 +39,7 @@ impl Report {
         }
     }
 
-    fn step(&mut self, name: &str, run: impl FnOnce() -> Outcome) {
+    pub fn step(&mut self, name: &str, run: impl FnOnce() -> Outcome) {
         println!("\n=== {name}");
         let start = Instant::now();
         let outcome = run();
@@ -44,11 +47,11 @@ impl Report {
     }
 }
 
-fn root() -> PathBuf {
+pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new(".")).to_owned()
 }
 
-fn cargo(arguments: &[&str]) -> Command {
+pub fn cargo(arguments: &[&str]) -> Command {
     let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     command.args(arguments).current_dir(root());
     command
@@ -66,6 +69,7 @@ pub fn test() -> Report {
     let mut report = Report::default();
     report.step("tests of the workspace", || outcome_of(cargo(&["test", "--workspace", "--locked"])));
     report.step("firmware for thumbv6m-none-eabi", thumb);
+    report.step("instruction counts of the correlation (callgrind)", || crate::bench::guard::guard(false));
     report.step("data of others", || {
         let shared = std::env::var_os("DAIC_SHARED").map_or_else(|| root().join("../shared"), PathBuf::from);
         if shared.join("golden").is_dir() && shared.join("data").is_dir() {
@@ -124,6 +128,12 @@ pub fn lint() -> Report {
     report.step("clippy", || {
         outcome_of(cargo(&["clippy", "--workspace", "--all-targets", "--locked", "--", "-D", "warnings"]))
     });
+    report.step("clippy of the kernel benchmarks", || {
+        let arguments = ["clippy", "-p", "daic-correlate", "--features", "bench", "--benches", "--locked"];
+        let mut command = cargo(&arguments);
+        command.args(["--", "-D", "warnings"]);
+        outcome_of(command)
+    });
     report.step("documentation", || {
         let mut command = cargo(&["doc", "--workspace", "--no-deps", "--locked"]);
         command.env("RUSTDOCFLAGS", "-D warnings");
@@ -164,19 +174,9 @@ pub fn figures() -> Report {
     report
 }
 
-pub fn bench() -> Report {
+/// Speed of the optics.
+pub fn bench_optics() -> Report {
     let mut report = Report::default();
-    report.step("speed of the correlation", || {
-        outcome_of(cargo(&[
-            "run",
-            "--release",
-            "--locked",
-            "--package",
-            "daic-correlate",
-            "--example",
-            "speed",
-        ]))
-    });
     report.step("speed of the optics", || {
         outcome_of(cargo(&[
             "run",

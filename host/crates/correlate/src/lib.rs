@@ -11,6 +11,9 @@
 #![forbid(unsafe_code)]
 #![allow(clippy::needless_range_loop)] // index loops are what the vector kernels are made of
 
+#[cfg(feature = "bench")]
+#[doc(hidden)]
+pub mod bench_support;
 mod consistency;
 mod correlate;
 mod dense;
