@@ -14,7 +14,8 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
     let [optics, shape, threads, repeats, files @ ..] = arguments.as_slice() else {
         return Err("live OPTICS affine|quadratic THREADS REPEATS FRAME…".into());
     };
-    let model = OpticalModel::new(&optics_section::from_section(&OpticsFile::load(Path::new(optics))?.optics)?)?;
+    let model =
+        OpticalModel::new(&optics_section::from_section(&OpticsFile::load(Path::new(optics))?.optics)?)?;
     let mut settings = Settings::default();
     settings.dic.shape = if shape == "affine" { Shape::Affine } else { Shape::Quadratic };
     let frames: Vec<_> = files.iter().map(|f| images::read(Path::new(f))).collect::<Result<_, _>>()?;

@@ -4,9 +4,7 @@ use super::matching::match_of;
 use super::{Grid, Match, Profile, Rectangle, Reference, Settings, profile};
 use crate::error::Error;
 use crate::progress::Progress;
-use daic_correlate::{
-    Guess, Image, Points, Reference as Subsets, Roi, ShapeParameters, Target, Workspace,
-};
+use daic_correlate::{Guess, Image, Points, Reference as Subsets, Roi, ShapeParameters, Target, Workspace};
 use daic_dataset::GreyImage;
 use daic_optics::{Decoder, OpticalModel};
 
@@ -131,11 +129,8 @@ impl Live {
         );
         a?;
         b?;
-        let guess = if self.last.iter().any(Option::is_some) {
-            Guess::Shapes(&self.last)
-        } else {
-            Guess::default()
-        };
+        let guess =
+            if self.last.iter().any(Option::is_some) { Guess::Shapes(&self.last) } else { Guess::default() };
         let found = self.workspace.correlate(
             &self.reference,
             &self.target,
