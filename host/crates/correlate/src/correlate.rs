@@ -213,7 +213,14 @@ impl Workspace {
         first.finish(seeds, &guess_sparse);
         let init = start.elapsed();
         observer.stage(Stage::Solve);
-        let proposals = self.dense.solve(&solver, points, &sparse, &first.outcomes, &mut run.outcomes);
+        let proposals = self.dense.solve(
+            &solver,
+            points,
+            &sparse,
+            &first.outcomes,
+            &mut run.outcomes,
+            observer,
+        );
         if settings.solver == SolverChoice::Dense {
             run.give_up(&proposals);
         } else {

@@ -12,6 +12,7 @@ use crate::point::{ShapeParameters, SolvedBy, Status};
 use crate::points::Points;
 use crate::shape::Warp;
 use rayon::prelude::*;
+use std::collections::HashSet;
 
 /// Reach of the local searches around a predicted displacement, pixels.
 const LOCAL_REACH: i32 = 47;
@@ -33,6 +34,8 @@ pub(crate) struct Propagation<'a> {
     pub(crate) observer: &'a dyn Observer,
     pub(crate) outcomes: Vec<Option<Outcome>>,
     done: usize,
+    /// The dense form has come first.
+    dense: bool,
     globals: Vec<[f64; 2]>,
 }
 
@@ -43,7 +46,13 @@ struct Task {
 
 impl<'a> Propagation<'a> {
     pub(crate) fn new(solver: &'a Solver<'a>, points: &'a Points, observer: &'a dyn Observer) -> Self {
-        Self { solver, points, observer, outcomes: vec![None; points.len()], done: 0, globals: Vec::new() }
+        Self { solver, points, observer, outcomes: vec![None; points.len()], done: 0, dense: false, globals: Vec::new() }
+    }
+
+    /// Tells the observer; a run that began with the dense form has announced a part already.
+    fn report(&mut self) {
+        let announced = if self.dense { self.points.len() * 2 / 3 } else { 0 };
+        self.observer.points(self.done.max(announced), self.points.len());
     }
 
     /// Points treated so far.
@@ -93,16 +102,24 @@ impl<'a> Propagation<'a> {
         }
     }
 
+    /// The start that a guess holds for one point.
+    fn given(&self, guess: &Guess<'_>, point: usize) -> Option<Warp> {
+        match guess {
+            Guess::Given(list) => list[point].map(|[u, v]| Warp::translation(u, v)),
+            Guess::Shapes(list) => {
+                let (_, offset) = self.points.centre(point);
+                Some(Warp::of(list[point].as_ref()?).moved(-offset[0], -offset[1]))
+            }
+            _ => None,
+        }
+    }
+
     /// Every point from its own displacement and derivatives.
     fn start_from(&mut self, list: &[Option<ShapeParameters>]) -> Vec<usize> {
         let tasks: Vec<Task> = list
             .iter()
             .enumerate()
-            .filter_map(|(point, shape)| {
-                let (_, offset) = self.points.centre(point);
-                let warp = Warp::of(shape.as_ref()?).moved(-offset[0], -offset[1]);
-                Some(Task { point, warp })
-            })
+            .filter_map(|(point, _)| Some(Task { point, warp: self.given(&Guess::Shapes(list), point)? }))
             .collect();
         let found = self.solve(&tasks);
         if found.is_empty() || 2 * found.len() < tasks.len() {
@@ -259,7 +276,7 @@ impl<'a> Propagation<'a> {
                 accepted.push(task.point);
             }
         }
-        observer.points(self.done, points.len());
+        self.report();
         accepted
     }
 
@@ -318,8 +335,19 @@ impl<'a> Propagation<'a> {
         sparse: Propagation<'_>,
     ) {
         self.globals = sparse.globals;
+        self.dense = true;
         self.done = self.outcomes.iter().filter(|o| o.is_some()).count();
-        let tasks: Vec<Task> = proposals.iter().map(|&(point, warp)| Task { point, warp }).collect();
+        let mut tasks: Vec<Task> = proposals.iter().map(|&(point, warp)| Task { point, warp }).collect();
+        let proposed: HashSet<usize> = proposals.iter().map(|p| p.0).collect();
+        for point in 0..self.points.len() {
+            if self.outcomes[point].is_none()
+                && !proposed.contains(&point)
+                && let Some(warp) = self.given(guess, point)
+            {
+                tasks.push(Task { point, warp });
+            }
+        }
+        tasks.sort_by_key(|t| t.point);
         self.solve(&tasks);
         let mut front: Vec<usize> = (0..self.points.len())
             .filter(|&k| self.outcomes[k].is_none())
@@ -344,7 +372,7 @@ impl<'a> Propagation<'a> {
             }
         }
         self.done = self.outcomes.len();
-        self.observer.points(self.done, self.points.len());
+        self.report();
     }
 
     /// Propagation, second attempts, and new seeds where propagation has not come.

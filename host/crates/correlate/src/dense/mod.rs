@@ -12,6 +12,7 @@ mod sums;
 mod tiling;
 mod warp;
 
+use crate::correlate::Observer;
 use crate::icgn::{Outcome, Solver};
 use crate::point::{SolvedBy, Status};
 use crate::points::{Grid, Points};
@@ -28,9 +29,15 @@ use tiling::{LANES, Task, Tiling, moments};
 /// Passes over the image: the second brings the field of the first to within its own square; a third
 /// changes nothing.
 const PASSES: usize = 2;
-/// Largest distance, in pixels, between a subset's polynomial and the common field up to which its
-/// square may be neglected.
+/// Largest distance, in pixels, between a subset's polynomial and the common field at which the dense
+/// form is used at all.
 const LINEAR: f32 = 0.1;
+/// Error of a displacement per square of that distance, 1/pixel: what a jump next to 21-pixel subsets
+/// was seen to do (3e-3 px at 0.1 px).
+const CURVATURE: f64 = 0.33;
+/// That error may be this part of the point's own uncertainty, or this many pixels.
+const NEGLIGIBLE: f64 = 0.2;
+const NEGLIGIBLE_PX: f64 = 1e-4;
 /// Distance up to which a point's result is good enough to carry the field for the next pass.
 const CARRIES: f32 = 2.0;
 /// Distance between sparse points, in subset widths.
@@ -183,6 +190,7 @@ impl Dense {
         sparse: &Sparse,
         start: &[Option<Outcome>],
         outcomes: &mut [Option<Outcome>],
+        observer: &dyn Observer,
     ) -> Vec<(usize, Warp)> {
         let Some(Key { tiling, order, .. }) = self.key else {
             return Vec::new();
@@ -191,8 +199,8 @@ impl Dense {
             return Vec::new();
         };
         self.nodes.from_sparse(&tiling, &sparse.columns, &sparse.rows, &known);
-        for pass in 0..PASSES {
-            if pass > 0 {
+        for number in 0..PASSES {
+            if number > 0 {
                 self.carry(&tiling, order);
             }
             let pass = Pass {
@@ -205,8 +213,14 @@ impl Dense {
             };
             let buffers = &self.buffers;
             self.shares.par_iter_mut().for_each(|share| {
-                with(buffers, |b| pass.run(solver.level, &share.task, &share.prepared, b, &mut share.out));
+                if !observer.cancelled() {
+                    with(buffers, |b| pass.run(solver.level, &share.task, &share.prepared, b, &mut share.out));
+                }
             });
+            if observer.cancelled() {
+                return Vec::new();
+            }
+            observer.points(points.len() * (number + 1) / (PASSES + 1), points.len());
         }
         self.collect(solver, points, &tiling, order, outcomes)
     }
@@ -416,6 +430,7 @@ impl Dense {
         let centre = ((tiling.x0 + i * tiling.step) as i32, (tiling.y0 + j * tiling.step) as i32);
         let numbers = crate::icgn::Numbers { sff, energy, variance, zncc, gain };
         match solver.verdict(centre, &warp, &numbers) {
+            Ok((_, sigma)) if !negligible(distance, sigma) => (None, Some(warp)),
             Ok((independent, sigma)) => {
                 let o = Outcome {
                     warp,
@@ -431,6 +446,12 @@ impl Dense {
             Err(_) => (None, Some(warp)),
         }
     }
+}
+
+/// Whether what the dense form neglects at a point does not matter beside its uncertainty.
+fn negligible(distance: f32, sigma: [f32; 2]) -> bool {
+    let error = CURVATURE * f64::from(distance).powi(2);
+    error <= (NEGLIGIBLE * f64::from(sigma[0].min(sigma[1]))).max(NEGLIGIBLE_PX)
 }
 
 /// The grid's point nearest to node (i, j), at most `reach` nodes away along each axis.

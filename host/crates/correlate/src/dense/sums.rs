@@ -3,6 +3,7 @@
 use super::tiling::{DEGREES, LANES, Task, Tiling, moments, monomial};
 use crate::sampler::V;
 use fearless_simd::prelude::*;
+use fearless_simd_macros::simd;
 
 /// Calls `$batch!(degree, planes)` for all lines of all groups.
 macro_rules! each_batch {
@@ -98,52 +99,16 @@ impl SumBuffers {
         if rem > 0 && full {
             let out = &mut self.ring[q * slot..];
             along_x(s, tiling, task, groups, &self.shifts, &self.part, out);
-            self.down(s, tiling, task, groups, b);
+            down(s, self, tiling, task, groups, b);
         }
         if whole {
             let at = b % q * slot;
             along_x(s, tiling, task, groups, &self.shifts, &self.tiles, &mut self.ring[at..at + slot]);
         }
         if rem == 0 && full {
-            self.down(s, tiling, task, groups, b);
+            down(s, self, tiling, task, groups, b);
         }
         full
-    }
-
-    /// Sums of the subsets whose last row of tiles is `b`.
-    #[inline(always)]
-    fn down<S: Simd>(&mut self, s: S, tiling: &Tiling, task: &Task, groups: &[Group], b: usize) {
-        let q = tiling.whole().0;
-        let first = b - tiling.last();
-        for m in 0..q {
-            self.turned[(first + m) % q] = self.shifts[m];
-        }
-        let (w, slot) = (task.width, self.subsets.len());
-        let Self { ring, subsets, turned, .. } = self;
-        // a batch of lines shares the loop over the tiles
-        macro_rules! batch {
-            ($n:literal, $planes:expr) => {{
-                let planes: [[usize; BATCH]; $n + 1] = $planes;
-                for k in (0..w).step_by(LANES) {
-                    let mut acc = [[V::splat(s, 0.0); DEGREES]; BATCH];
-                    for (row, c) in ring.chunks_exact(slot).zip(turned.iter()) {
-                        for e in 0..=$n {
-                            for l in 0..BATCH {
-                                let o = planes[e][l] * w + k;
-                                add::<S, $n>(s, &mut acc[l], c, e, V::from_slice(s, &row[o..o + LANES]));
-                            }
-                        }
-                    }
-                    for e in 0..=$n {
-                        for l in 0..BATCH {
-                            let o = planes[e][l] * w + k;
-                            acc[l][e].store_slice(&mut subsets[o..o + LANES]);
-                        }
-                    }
-                }
-            }};
-        }
-        each_batch!(groups, |i, e| monomial(i, e), batch);
     }
 }
 
@@ -177,7 +142,43 @@ fn add<S: Simd, const N: usize>(s: S, acc: &mut [V<S>; DEGREES], c: &Shift, e: u
     }
 }
 
-#[inline(always)]
+    /// Sums of the subsets whose last row of tiles is `b`.
+#[simd]
+fn down<S: Simd>(s: S, buffers: &mut SumBuffers, tiling: &Tiling, task: &Task, groups: &[Group], b: usize) {
+        let q = tiling.whole().0;
+        let first = b - tiling.last();
+        for m in 0..q {
+            buffers.turned[(first + m) % q] = buffers.shifts[m];
+        }
+        let (w, slot) = (task.width, buffers.subsets.len());
+        let SumBuffers { ring, subsets, turned, .. } = buffers;
+        // a batch of lines shares the loop over the tiles
+        macro_rules! batch {
+            ($n:literal, $planes:expr) => {{
+                let planes: [[usize; BATCH]; $n + 1] = $planes;
+                for k in (0..w).step_by(LANES) {
+                    let mut acc = [[V::splat(s, 0.0); DEGREES]; BATCH];
+                    for (row, c) in ring.chunks_exact(slot).zip(turned.iter()) {
+                        for e in 0..=$n {
+                            for l in 0..BATCH {
+                                let o = planes[e][l] * w + k;
+                                add::<S, $n>(s, &mut acc[l], c, e, V::from_slice(s, &row[o..o + LANES]));
+                            }
+                        }
+                    }
+                    for e in 0..=$n {
+                        for l in 0..BATCH {
+                            let o = planes[e][l] * w + k;
+                            acc[l][e].store_slice(&mut subsets[o..o + LANES]);
+                        }
+                    }
+                }
+            }};
+        }
+        each_batch!(groups, |i, e| monomial(i, e), batch);
+    }
+
+#[simd]
 fn along_x<S: Simd>(
     s: S,
     tiling: &Tiling,

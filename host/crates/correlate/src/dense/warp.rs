@@ -4,6 +4,7 @@ use crate::plane::Plane;
 use crate::sampler::{V, convolve, sample_lanes, shifted, weights};
 use crate::subset::LANES;
 use fearless_simd::{prelude::*, u8x32};
+use fearless_simd_macros::simd;
 
 /// How eight pixels in a row lie between the nodes, by the phase of the first one.
 pub(crate) struct Spread {
@@ -40,7 +41,7 @@ pub(crate) struct RowField<'a> {
 /// of eight. Loads are contiguous wherever the integer part of the displacement takes at most two
 /// values over eight pixels; elsewhere each pixel is read by itself. What lies outside the padded
 /// plane is arbitrary but finite.
-#[inline(always)]
+#[simd]
 pub(crate) fn warp_row<S: Simd, const N: usize, const N1: usize>(
     s: S,
     plane: &Plane,
