@@ -11,10 +11,12 @@
 #![forbid(unsafe_code)]
 #![allow(clippy::needless_range_loop)] // index loops are what the vector kernels are made of
 
+mod begin;
 mod consistency;
 mod correlate;
 mod dense;
 mod eulerian;
+mod features;
 mod fft;
 mod icgn;
 mod image;
@@ -33,6 +35,7 @@ mod sequence;
 mod settings;
 mod shape;
 mod simd;
+mod start;
 pub mod strain;
 mod subset;
 mod views;
@@ -42,6 +45,7 @@ pub use correlate::{
     simd_level,
 };
 pub use eulerian::{EulerianPoint, eulerian};
+pub use features::{Affine, AffineGroup, FeatureMatch, FeatureMatches, match_features};
 pub use image::{Image, ImageError, Mask};
 pub use point::{Point, ShapeParameters, SolvedBy, Status};
 pub use points::{Grid, Points, PointsError, Rectangle, Roi};
@@ -49,4 +53,5 @@ pub use prepared::{Reference, Target};
 pub use sequence::{Sequence, SequenceError, SequenceFrame, SequenceState, Update};
 pub use settings::{Criterion, Interpolation, Settings, SettingsError, SolverChoice};
 pub use shape::Shape;
+pub use start::{FeatureStart, RejectedSeed, Seed, StartAttempt, StartMethod, StartReport, StartWarning};
 pub use views::{View, Views, ViewsError, find_views};

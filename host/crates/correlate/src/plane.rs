@@ -2,10 +2,10 @@
 
 use crate::image::Image;
 use crate::settings::Interpolation;
-use rayon::prelude::*;
 use crate::simd::dispatch;
 use fearless_simd::{Level, f32x8, prelude::*};
 use fearless_simd_macros::simd;
+use rayon::prelude::*;
 
 /// Pixels added on every side. The slowest pole (0.43) has died out to 2e-12 over this distance,
 /// so the recursions may start from a constant, and warped subsets may overhang a little.

@@ -106,11 +106,7 @@ fn run<S: Simd, const N: usize, const N1: usize, const O: usize>(
     let powers: Vec<[f32; DEGREES]> = (0..tiling.step).map(|p| tiling.powers(p)).collect();
     let (step, lead) = (tiling.step, tiling.lead());
     let phases: Vec<Phase> = (0..step)
-        .map(|p| Phase {
-            node: (p + lead) / step,
-            t: ((p + lead) % step) as f32 / step as f32,
-            x: powers[p],
-        })
+        .map(|p| Phase { node: (p + lead) / step, t: ((p + lead) % step) as f32 / step as f32, x: powers[p] })
         .collect();
     let spread = Spread::new(step, lead);
     let rem = tiling.whole().1;
