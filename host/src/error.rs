@@ -120,6 +120,11 @@ pub enum Error {
         /// The first image.
         reference: PathBuf,
     },
+    /// First displacements of a series, which come from the frame before.
+    #[error(
+        "--guess and --seed belong to two images; each image of a series begins where the one before it ended"
+    )]
+    SeriesGuess,
     /// A folder with something else in it.
     #[error("{} holds something else than a sequence of daic; choose another folder", path.display())]
     FolderTaken {

@@ -5,7 +5,7 @@ use crate::measure::{Rectangle, image_of};
 use crate::progress::Progress;
 use crate::usage::{Clock, Seconds};
 use daic_correlate::{
-    EulerianPoint, Guess, Observer, Point, Points, Reference, Roi, Settings, Stage, Target,
+    EulerianPoint, Guess, Observer, Point, Points, Reference, Roi, Settings, Stage, StartReport, Target,
 };
 use daic_dataset::{Column, GreyImage, Table};
 use std::sync::Mutex;
@@ -17,6 +17,8 @@ pub struct PairResult {
     pub points: Vec<Point>,
     /// Where they were laid out.
     pub layout: Points,
+    /// Where the first displacements came from.
+    pub start: StartReport,
     /// Images to coefficients and gradients.
     pub prepare: Seconds,
     /// First displacements.
@@ -138,14 +140,15 @@ impl Observer for Watch<'_> {
     }
 }
 
-/// Correlates `deformed` with `reference` on a grid of `step` pixels.
+/// Correlates `deformed` with `reference` on a grid of `step` pixels, beginning with `guess`.
 ///
 /// # Errors
-/// A setting that cannot be used.
+/// A setting or a guess that cannot be used.
 pub fn correlate(
     reference: &GreyImage,
     deformed: &GreyImage,
     settings: &Settings,
+    guess: &Guess<'_>,
     step: usize,
     roi: Option<Rectangle>,
     progress: &dyn Progress,
@@ -159,13 +162,14 @@ pub fn correlate(
     let (subsets, target) = rayon::join(|| Reference::new(a), || Target::new(b, settings.interpolation));
     let prepare = clock.elapsed();
     let watch = Watch { progress, clock, begin_of_solve: Mutex::default() };
-    let found = daic_correlate::correlate(&subsets, &target, &points, &Guess::Fft, settings, &watch)?;
+    let found = daic_correlate::correlate(&subsets, &target, &points, guess, settings, &watch)?;
     let total = clock.elapsed();
     let begin = watch.begin_of_solve.into_inner().unwrap_or_default();
     let between = |from: Seconds, to: Seconds| Seconds { cpu: to.cpu - from.cpu, wall: to.wall - from.wall };
     Ok(PairResult {
         points: found.points,
         layout: points,
+        start: found.start,
         prepare,
         init: between(prepare, begin),
         solve: between(begin, total),

@@ -141,6 +141,13 @@ pub struct CorrelateArgs {
     /// Region of interest in pixels: X,Y,WIDTH,HEIGHT
     #[arg(long, value_name = "X,Y,W,H", value_parser = parse_roi, allow_hyphen_values = true)]
     pub roi: Option<Roi>,
+    /// Where first displacements of two images come from
+    #[arg(long, default_value = "auto", conflicts_with = "seed")]
+    pub guess: GuessArg,
+    /// Known displacement of a place, good to about 10 px: X,Y,U,V, or X,Y,U,V,UX,UY,VX,VY where the
+    /// material has turned; may be given several times
+    #[arg(long, value_name = "X,Y,U,V[,UX,UY,VX,VY]", value_parser = parse_seed, allow_hyphen_values = true)]
+    pub seed: Vec<daic_correlate::Seed>,
     /// Points to this file (.csv or .npz); of a series, to this folder
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
@@ -213,6 +220,16 @@ pub struct DicArgs {
     /// Interpolating B-spline
     #[arg(long)]
     pub interpolation: Option<InterpolationArg>,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum GuessArg {
+    /// Cross-correlation, and features where it does not lead to most of the points
+    Auto,
+    /// Cross-correlation alone: shifts up to half the image
+    Fft,
+    /// Matched features: any rotation, change of size, large shifts
+    Features,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -370,4 +387,14 @@ fn parse_shift(text: &str) -> Result<Shift, String> {
     } else {
         Err(format!("found `{text}`, allowed are -65536 to 65536 pixels"))
     }
+}
+
+fn parse_seed(text: &str) -> Result<daic_correlate::Seed, String> {
+    let seed = |[x, y, u, v]: [f64; 4], gradient| daic_correlate::Seed { x, y, u, v, gradient };
+    if text.split(',').count() > 4 {
+        let form = "X,Y,U,V,UX,UY,VX,VY: a place, its displacement in pixels and the displacement's gradient";
+        let [x, y, u, v, ux, uy, vx, vy] = numbers(text, form)?;
+        return Ok(seed([x, y, u, v], Some([ux, uy, vx, vy])));
+    }
+    numbers(text, "X,Y,U,V: a place and its displacement in pixels").map(|place| seed(place, None))
 }

@@ -1,7 +1,7 @@
 //! What each command does: arguments to facade calls, results to an answer.
 
 use super::arguments::{
-    CorrelateArgs, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, GratingsArg, InitArgs,
+    CorrelateArgs, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, GratingsArg, GuessArg, InitArgs,
     InterpolationArg, PhaseArgs, ProcessArgs, ProfileArgs, Roi, RunArgs, ShapeArg, UpdateArg, WindowArg,
 };
 #[cfg(feature = "sim")]
@@ -13,6 +13,7 @@ use daic::{
     Error, Progress as _, doctor as checks, frames, images, optics_section, pair, phase as gratings,
     process as processing, reports,
 };
+use daic_correlate::{Guess, StartReport, StartWarning};
 use daic_dataset::{Existing, GreyImage, atomic};
 use daic_optics::{Decoder, OpticalModel};
 use daic_rig::experiment::{self, Experiment, OpticsFile};
@@ -125,7 +126,13 @@ pub fn correlate(arguments: &CorrelateArgs, output: &Output) -> Result<Answer, E
     let mut dic = daic_correlate::Settings::default();
     let mut step = 5;
     apply(&arguments.dic, &mut dic, &mut step);
-    let found = pair::correlate(&reference, &deformed, &dic, step, roi, output)?;
+    let guess = match arguments.guess {
+        _ if !arguments.seed.is_empty() => Guess::Seeds(&arguments.seed),
+        GuessArg::Auto => Guess::Auto,
+        GuessArg::Fft => Guess::Fft,
+        GuessArg::Features => Guess::Features,
+    };
+    let found = pair::correlate(&reference, &deformed, &dic, &guess, step, roi, output)?;
     let table = match arguments.description.into() {
         Description::Lagrangian => found.table()?,
         Description::Eulerian => found.eulerian_table()?,
@@ -142,11 +149,12 @@ pub fn correlate(arguments: &CorrelateArgs, output: &Output) -> Result<Answer, E
         "peak_rss_mb": daic::usage::peak_rss_mb(),
         "settings": as_json(&dic)?,
         "step": step,
+        "start": start_json(&found.start),
         "out": arguments.out.as_ref().map(|p| p.display().to_string()),
     });
     let ok = || found.points.iter().filter(|p| p.status.is_ok());
     let (u, v) = (measure::spread(ok().map(|p| p.u)), measure::spread(ok().map(|p| p.v)));
-    let text = format!(
+    let mut text = format!(
         "{} of {} points converged in {:.2} s\nu {:.4} ± {:.4} px, v {:.4} ± {:.4} px (mean and scatter over the points)",
         found.converged(),
         found.points.len(),
@@ -156,10 +164,67 @@ pub fn correlate(arguments: &CorrelateArgs, output: &Output) -> Result<Answer, E
         v.mean,
         v.std
     );
+    text.push_str(&start_text(&found.start));
     Ok(Answer::new(json, text))
 }
 
+fn start_json(start: &StartReport) -> serde_json::Value {
+    let attempts: Vec<_> = start
+        .attempts
+        .iter()
+        .map(|a| json!({ "method": a.method.name(), "tried": a.tried, "accepted": a.accepted }))
+        .collect();
+    let rejected: Vec<_> =
+        start.rejected.iter().map(|r| json!({ "seed": r.index, "status": r.status.name() })).collect();
+    let groups = |f: &daic_correlate::FeatureStart| -> Vec<_> {
+        f.groups
+            .iter()
+            .map(|g| {
+                json!({
+                    "inliers": g.inliers,
+                    "rotation_deg": g.affine.rotation_deg(),
+                    "stretches": g.affine.stretches(),
+                })
+            })
+            .collect()
+    };
+    json!({
+        "method": start.method().map(daic_correlate::StartMethod::name),
+        "attempts": attempts,
+        "seeds_rejected": rejected,
+        "features": start.features.as_ref().map(|f| json!({ "matches": f.matches, "motions": groups(f) })),
+        "no_guess": start.unreached,
+        "warnings": start.warnings.iter().map(ToString::to_string).collect::<Vec<_>>(),
+    })
+}
+
+/// Lines on the start: one if all is well, else what is wrong and the way out.
+fn start_text(start: &StartReport) -> String {
+    let mut text = String::new();
+    for a in &start.attempts {
+        write!(text, "\nstart by {}: {} of {} seeds confirmed", a.method, a.accepted, a.tried).ok();
+    }
+    let by_seeds = start.attempts.iter().any(|a| a.method == daic_correlate::StartMethod::Seeds);
+    for warning in &start.warnings {
+        let way_out = match warning {
+            StartWarning::SeedsRejected { .. } => {
+                let list: Vec<String> =
+                    start.rejected.iter().map(|r| format!("seed {}: {}", r.index + 1, r.status)).collect();
+                format!(" ({})", list.join(", "))
+            }
+            StartWarning::ShapeTooSimple { .. } => " (--shape affine)".to_owned(),
+            _ if by_seeds => ": give further ones with --seed X,Y,U,V".to_owned(),
+            _ => ": try --seed X,Y,U,V for a place whose displacement you know".to_owned(),
+        };
+        write!(text, "\nwarning: {warning}{way_out}").ok();
+    }
+    text
+}
+
 fn correlate_sequence(arguments: &CorrelateArgs, output: &Output) -> Result<Answer, Error> {
+    if !arguments.seed.is_empty() || !matches!(arguments.guess, GuessArg::Auto) {
+        return Err(Error::SeriesGuess);
+    }
     let frames = frames::expand(&arguments.deformed, &arguments.reference)?;
     let Some(out) = &arguments.out else {
         return Err(Error::NoFolder { frames: frames.len(), reference: arguments.reference.clone() });

@@ -201,7 +201,7 @@ impl Reference {
                 &self.subsets,
                 &target,
                 points,
-                &Guess::Fft,
+                &Guess::Auto,
                 &self.settings.dic,
                 &observer,
             )?)

@@ -9,6 +9,7 @@ use crate::prepared::{Reference, Target};
 use crate::propagate::Propagation;
 use crate::settings::{Interpolation, Settings, SettingsError, SolverChoice};
 use crate::simd::dispatch;
+use crate::start::{Seed, StartReport};
 use fearless_simd::{Level, Simd};
 use std::time::{Duration, Instant};
 use thiserror::Error;
@@ -16,9 +17,15 @@ use thiserror::Error;
 /// Where the first displacements come from.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Guess<'a> {
-    /// Whole-image and local cross-correlation by FFT; shifts up to half the image.
+    /// Cross-correlation by FFT, and where it does not lead to most of the points, features.
     #[default]
+    Auto,
+    /// Whole-image and local cross-correlation by FFT; shifts up to half the image, rotations of a
+    /// few degrees.
     Fft,
+    /// Matched features alone (see [`match_features`](crate::match_features)): any rotation, scales
+    /// of 0.6–1.6.
+    Features,
     /// Whole-pixel search over a range of displacements, e.g. along the diffraction direction when
     /// one view is matched to the other in the same frame.
     Search {
@@ -34,6 +41,10 @@ pub enum Guess<'a> {
     /// half of them fail the frame has moved on too far, and the default guess is used instead;
     /// otherwise points with `None`, and those that fail, are reached from their neighbours.
     Shapes(&'a [Option<ShapeParameters>]),
+    /// Displacements of a few places, with gradients where the material has turned: the point
+    /// nearest to each is started there, the rest is reached from these. Seeds that are not
+    /// confirmed are named in the [`StartReport`].
+    Seeds(&'a [Seed]),
 }
 
 /// Stage of a run.
@@ -104,8 +115,8 @@ pub enum CorrelateError {
         /// Points.
         points: usize,
     },
-    /// A guess or a search range is not a number, or too large.
-    #[error("the initial guess {index} is not a finite displacement within ±{limit} pixels")]
+    /// A guess, a seed or a search range is not a number, or too large.
+    #[error("the initial guess {index} is not made of finite numbers within ±{limit} pixels")]
     GuessValue {
         /// Index in the list; 0 for a search range.
         index: usize,
@@ -142,12 +153,14 @@ pub struct Timing {
 }
 
 /// Result of a run: one entry per point, in the points' order.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Correlation {
     /// Results.
     pub points: Vec<Point>,
     /// Wall times.
     pub timing: Timing,
+    /// What the initial guesses came from, and how far they reached.
+    pub start: StartReport,
 }
 
 impl Correlation {
@@ -213,18 +226,13 @@ impl Workspace {
         first.finish(seeds, &guess_sparse);
         let init = start.elapsed();
         observer.stage(Stage::Solve);
-        let proposals = self.dense.solve(
-            &solver,
-            points,
-            &sparse,
-            &first.outcomes,
-            &mut run.outcomes,
-            observer,
-        );
+        let proposals =
+            self.dense.solve(&solver, points, &sparse, &first.outcomes, &mut run.outcomes, observer);
+        run.inherit(first, &sparse.points);
         if settings.solver == SolverChoice::Dense {
             run.give_up(&proposals);
         } else {
-            run.complete(&proposals, guess, first);
+            run.complete(&proposals, guess);
         }
         finished(run, start, init)
     }
@@ -307,9 +315,12 @@ fn finished(run: Propagation<'_>, start: Instant, init: Duration) -> Result<Corr
         return Err(CorrelateError::Cancelled { done: run.done(), total: points.len() });
     }
     let mut outcomes = run.outcomes;
+    let mut report = run.report;
     consistency::judge(run.solver, points, &mut outcomes);
-    let points = outcomes.iter().enumerate().map(|(k, o)| point(points, k, o.as_ref())).collect();
-    Ok(Correlation { points, timing: Timing { init, solve: start.elapsed() - init } })
+    let points: Vec<Point> = outcomes.iter().enumerate().map(|(k, o)| point(points, k, o.as_ref())).collect();
+    let settings = run.solver.settings;
+    report.close(&points, settings.shape, settings.radius());
+    Ok(Correlation { points, timing: Timing { init, solve: start.elapsed() - init }, start: report })
 }
 
 /// Name of the SIMD instruction set that the kernels use on this machine.
@@ -343,7 +354,7 @@ fn check(
     }
     let usable = |c: f64| c.is_finite() && c.abs() <= LIMIT;
     match guess {
-        Guess::Fft => {}
+        Guess::Auto | Guess::Fft | Guess::Features => {}
         Guess::Search { u, v } => {
             if ![u.0, u.1, v.0, v.1].into_iter().all(usable) {
                 return Err(CorrelateError::GuessValue { index: 0, limit: LIMIT });
@@ -358,6 +369,11 @@ fn check(
                 return Err(CorrelateError::GuessCount { guesses: list.len(), points: points.len() });
             }
             if let Some(index) = list.iter().position(|g| g.is_some_and(|d| !d.into_iter().all(usable))) {
+                return Err(CorrelateError::GuessValue { index, limit: LIMIT });
+            }
+        }
+        Guess::Seeds(list) => {
+            if let Some(index) = list.iter().position(|s| !s.numbers().all(usable)) {
                 return Err(CorrelateError::GuessValue { index, limit: LIMIT });
             }
         }

@@ -20,6 +20,12 @@ impl Window {
         Self { u: (u - reach, u + reach), v: (v - reach, v + reach) }
     }
 
+    /// Whole pixels that hold the given ranges.
+    pub(crate) fn range(u: (f64, f64), v: (f64, f64)) -> Self {
+        let whole = |r: (f64, f64)| (r.0.floor() as i32, r.1.ceil() as i32);
+        Self { u: whole(u), v: whole(v) }
+    }
+
     fn size(&self) -> (usize, usize) {
         ((self.u.1 - self.u.0).max(0) as usize + 1, (self.v.1 - self.v.0).max(0) as usize + 1)
     }
@@ -257,12 +263,18 @@ fn unpack(layout: &Layout, subset: &Subset, stride: usize, out: &mut [f32]) {
     }
 }
 
-/// Whole-image shifts, best first: cross-correlation of both images, reduced to at most
-/// [`REDUCED`] pixels on a side and freed from their slow brightness variations. Shifts up to half
-/// the image are found.
-pub(crate) fn global_shifts(reference: &Image, target: &Image, count: usize) -> Vec<[f64; 2]> {
+/// Whole-image shifts, best first: cross-correlation of both images, reduced to at most `side`
+/// pixels on a side and freed from their slow brightness variations. Shifts up to half the image
+/// are found, none nearer than `apart` pixels to the next along both axes.
+pub(crate) fn global_shifts(
+    reference: &Image,
+    target: &Image,
+    count: usize,
+    side: usize,
+    apart: i32,
+) -> Vec<[f64; 2]> {
     let largest = reference.width().max(reference.height());
-    let factor = largest.div_ceil(REDUCED).max(1);
+    let factor = largest.div_ceil(side).max(1);
     let (a, w, h) = reduced(reference, factor);
     let (b, bw, bh) = reduced(target, factor);
     if (w, h) != (bw, bh) || w < 4 || h < 4 {
@@ -305,16 +317,16 @@ pub(crate) fn global_shifts(reference: &Image, target: &Image, count: usize) -> 
         }
         let (u, v) = (best.1, best.2);
         found.push([f64::from(u) * factor as f64, f64::from(v) * factor as f64]);
-        for dv in -2..=2 {
-            for du in -2..=2 {
+        // what the neighbourhood of this shift covers is no other shift
+        let reach = (apart / factor as i32).max(2);
+        for dv in -reach..=reach {
+            for du in -reach..=reach {
                 map[place(u + du, v + dv)] = f32::NEG_INFINITY;
             }
         }
     }
     found
 }
-
-const REDUCED: usize = 256;
 
 fn reduced(image: &Image, factor: usize) -> (Vec<f32>, usize, usize) {
     let (w, h) = (image.width() / factor, image.height() / factor);

@@ -137,11 +137,9 @@ impl<'a> Solver<'a> {
         scratch.subset.centre = None;
     }
 
-    /// Whether the subset around (x, y), displaced like `warp`'s centre without deforming, clearly
-    /// leaves the deformed image.
+    /// Whether the subset around (x, y), displaced by `warp`, clearly leaves the deformed image.
     pub(crate) fn leaves(&self, x: i32, y: i32, warp: &Warp) -> bool {
-        let moved = Warp::translation(warp.0[0][0], warp.0[1][0]);
-        !self.inside(x, y, &moved, 2.0)
+        !self.inside(x, y, warp, 2.0)
     }
 
     /// Whether the warped subset stays within `margin` pixels of the deformed image.
@@ -228,8 +226,10 @@ impl<'a> Solver<'a> {
             None => {
                 let freedom = (n - 2.0 - 2.0 * m as f64).max(1.0);
                 let raw = 2.0 * sff * (1.0 - zncc).max(0.0) / freedom;
-                let s2 = raw * 2.0 / (1.0 + self.noise.interpolated_over(warp, r));
-                (s2, 0.5 * s2)
+                // the same noise in the grey levels of both images
+                let gain2 = gain * gain;
+                let s2 = raw * (1.0 + gain2) / (1.0 + gain2 * self.noise.interpolated_over(warp, r));
+                (s2, s2 / (1.0 + gain2))
             }
         };
         let mut out = [f32::NAN; 2];

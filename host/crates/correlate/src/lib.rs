@@ -11,6 +11,7 @@
 #![forbid(unsafe_code)]
 #![allow(clippy::needless_range_loop)] // index loops are what the vector kernels are made of
 
+mod begin;
 #[cfg(feature = "bench")]
 #[doc(hidden)]
 pub mod bench_support;
@@ -18,6 +19,7 @@ mod consistency;
 mod correlate;
 mod dense;
 mod eulerian;
+mod features;
 mod fft;
 mod icgn;
 mod image;
@@ -36,6 +38,7 @@ mod sequence;
 mod settings;
 mod shape;
 mod simd;
+mod start;
 pub mod strain;
 mod subset;
 mod views;
@@ -45,6 +48,7 @@ pub use correlate::{
     simd_level,
 };
 pub use eulerian::{EulerianPoint, eulerian};
+pub use features::{Affine, AffineGroup, FeatureMatch, FeatureMatches, match_features};
 pub use image::{Image, ImageError, Mask};
 pub use point::{Point, ShapeParameters, SolvedBy, Status};
 pub use points::{Grid, Points, PointsError, Rectangle, Roi};
@@ -52,4 +56,5 @@ pub use prepared::{Reference, Target};
 pub use sequence::{Sequence, SequenceError, SequenceFrame, SequenceState, Update};
 pub use settings::{Criterion, Interpolation, Settings, SettingsError, SolverChoice};
 pub use shape::Shape;
+pub use start::{FeatureStart, RejectedSeed, Seed, StartAttempt, StartMethod, StartReport, StartWarning};
 pub use views::{View, Views, ViewsError, find_views};

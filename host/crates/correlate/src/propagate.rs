@@ -6,26 +6,27 @@
 //! answer. Points that fail hand on nothing.
 
 use crate::correlate::{Guess, Observer};
-use crate::fft::{Search, Window, global_shifts};
+use crate::features::FeatureMatches;
+use crate::fft::{Search, Window};
 use crate::icgn::{Outcome, Scratch, Solver};
-use crate::point::{ShapeParameters, SolvedBy, Status};
+use crate::point::{SolvedBy, Status};
 use crate::points::Points;
-use crate::shape::Warp;
+use crate::shape::{Shape, Warp};
+use crate::start::{StartMethod, StartReport};
 use rayon::prelude::*;
 use std::collections::HashSet;
 
-/// Reach of the local searches around a predicted displacement, pixels.
-const LOCAL_REACH: i32 = 47;
 /// Reach of the search at points which failed although their neighbours succeeded.
 const RETRY_REACH: i32 = 7;
-/// Points per seed, and the most seeds.
-const POINTS_PER_SEED: usize = 1500;
-const MAX_SEEDS: usize = 25;
-/// Seeds that may search the whole deformed image when nothing else has worked.
-const WIDE_SEEDS: usize = 4;
-
+/// Rounds of second attempts after the first.
+const RETRIES: usize = 8;
+/// ZNCC below which an accepted seed is also searched in the other windows: periodic textures match
+/// in many places, but better in one.
+pub(crate) const DOUBTFUL: f64 = 0.75;
+/// Difference in ZNCC by which a neighbour must be better to cast doubt on an accepted point.
+const CLEARLY: f64 = 0.1;
 /// Seeds that are searched before it is asked whether searching pays.
-const BATCH: usize = 64;
+pub(crate) const BATCH: usize = 64;
 
 /// State of a run.
 pub(crate) struct Propagation<'a> {
@@ -33,24 +34,45 @@ pub(crate) struct Propagation<'a> {
     pub(crate) points: &'a Points,
     pub(crate) observer: &'a dyn Observer,
     pub(crate) outcomes: Vec<Option<Outcome>>,
-    done: usize,
+    pub(crate) done: usize,
     /// The dense form has come first.
     dense: bool,
-    globals: Vec<[f64; 2]>,
+    /// Shifts of the whole image.
+    pub(crate) globals: Vec<[f64; 2]>,
+    /// Matched features, where they were needed.
+    pub(crate) features: Option<FeatureMatches>,
+    /// What the run began with.
+    pub(crate) report: StartReport,
 }
 
-struct Task {
-    point: usize,
-    warp: Warp,
+pub(crate) struct Task {
+    pub(crate) point: usize,
+    pub(crate) warp: Warp,
+}
+
+impl Task {
+    pub(crate) fn translation(point: usize, u: f64, v: f64) -> Self {
+        Self { point, warp: Warp::translation(u, v) }
+    }
 }
 
 impl<'a> Propagation<'a> {
     pub(crate) fn new(solver: &'a Solver<'a>, points: &'a Points, observer: &'a dyn Observer) -> Self {
-        Self { solver, points, observer, outcomes: vec![None; points.len()], done: 0, dense: false, globals: Vec::new() }
+        Self {
+            solver,
+            points,
+            observer,
+            outcomes: vec![None; points.len()],
+            done: 0,
+            dense: false,
+            globals: Vec::new(),
+            features: None,
+            report: StartReport::default(),
+        }
     }
 
     /// Tells the observer; a run that began with the dense form has announced a part already.
-    fn report(&mut self) {
+    pub(crate) fn tell(&self) {
         let announced = if self.dense { self.points.len() * 2 / 3 } else { 0 };
         self.observer.points(self.done.max(announced), self.points.len());
     }
@@ -60,50 +82,12 @@ impl<'a> Propagation<'a> {
         self.done
     }
 
-    fn accepted(&self, k: usize) -> bool {
+    pub(crate) fn accepted(&self, k: usize) -> bool {
         self.outcomes[k].is_some_and(|o| o.status == Status::Converged)
     }
 
-    /// First displacements; returns the points accepted.
-    pub(crate) fn start(&mut self, guess: &Guess<'_>) -> Vec<usize> {
-        match guess {
-            Guess::Given(list) => {
-                let tasks: Vec<Task> = list
-                    .iter()
-                    .enumerate()
-                    .filter_map(|(point, g)| g.map(|[u, v]| Task { point, warp: Warp::translation(u, v) }))
-                    .collect();
-                self.solve(&tasks)
-            }
-            Guess::Shapes(list) => self.start_from(list),
-            Guess::Search { u, v } => {
-                let window = Window {
-                    u: (u.0.floor() as i32, u.1.ceil() as i32),
-                    v: (v.0.floor() as i32, v.1.ceil() as i32),
-                };
-                let seeds = self.seeds();
-                self.search(&seeds, &[window])
-            }
-            Guess::Fft => {
-                let (a, b) = (&self.solver.reference.image, &self.solver.target.image);
-                self.globals = global_shifts(a, b, 2);
-                let seeds = self.seeds();
-                let windows = self.local_windows();
-                let found = self.search(&seeds, &windows);
-                if !found.is_empty() {
-                    return found;
-                }
-                let (w, h) = (a.width() as i32, a.height() as i32);
-                let whole = Window { u: (-w / 2, w / 2), v: (-h / 2, h / 2) };
-                let spread = seeds.len().div_ceil(WIDE_SEEDS).max(1);
-                let few: Vec<usize> = seeds.iter().copied().step_by(spread).collect();
-                self.search(&few, &[whole])
-            }
-        }
-    }
-
     /// The start that a guess holds for one point.
-    fn given(&self, guess: &Guess<'_>, point: usize) -> Option<Warp> {
+    pub(crate) fn given(&self, guess: &Guess<'_>, point: usize) -> Option<Warp> {
         match guess {
             Guess::Given(list) => list[point].map(|[u, v]| Warp::translation(u, v)),
             Guess::Shapes(list) => {
@@ -114,83 +98,9 @@ impl<'a> Propagation<'a> {
         }
     }
 
-    /// Every point from its own displacement and derivatives.
-    fn start_from(&mut self, list: &[Option<ShapeParameters>]) -> Vec<usize> {
-        let tasks: Vec<Task> = list
-            .iter()
-            .enumerate()
-            .filter_map(|(point, _)| Some(Task { point, warp: self.given(&Guess::Shapes(list), point)? }))
-            .collect();
-        let found = self.solve(&tasks);
-        if found.is_empty() || 2 * found.len() < tasks.len() {
-            self.outcomes.fill(None);
-            self.done = 0;
-            return self.start(&Guess::default());
-        }
-        // neighbours may have a better idea of the points that failed
-        for o in &mut self.outcomes {
-            if o.is_some_and(|o| {
-                !matches!(o.status, Status::Converged | Status::LowTexture | Status::Singular)
-            }) {
-                *o = None;
-                self.done -= 1;
-            }
-        }
-        let middle = |c: usize| {
-            let mut values: Vec<f64> = tasks.iter().map(|t| t.warp.0[c][0]).collect();
-            let half = values.len() / 2;
-            *values.select_nth_unstable_by(half, f64::total_cmp).1
-        };
-        self.globals = vec![[middle(0), middle(1)]];
-        found
-    }
-
-    fn local_windows(&self) -> Vec<Window> {
-        let mut windows: Vec<Window> =
-            self.globals.iter().map(|g| Window::around(g[0], g[1], LOCAL_REACH)).collect();
-        let zero = Window::around(0.0, 0.0, LOCAL_REACH);
-        if !windows.contains(&zero) {
-            windows.push(zero);
-        }
-        windows
-    }
-
-    /// Points spread over the region: those nearest to the centres of equal tiles.
-    fn seeds(&self) -> Vec<usize> {
-        let xy = self.points.positions();
-        let n = xy.len();
-        let side = ((n as f64 / POINTS_PER_SEED as f64).sqrt().ceil() as usize).clamp(2, MAX_SEEDS.isqrt());
-        let (mut lo, mut hi) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
-        for p in xy {
-            for c in 0..2 {
-                lo[c] = lo[c].min(p[c]);
-                hi[c] = hi[c].max(p[c]);
-            }
-        }
-        let mut best = vec![(f64::INFINITY, usize::MAX); side * side];
-        for (k, p) in xy.iter().enumerate() {
-            let (centre, _) = self.points.centre(k);
-            if !self.solver.fits(centre.0, centre.1) {
-                continue;
-            }
-            let mut tile = [0usize; 2];
-            let mut distance = 0.0;
-            for c in 0..2 {
-                let size = (hi[c] - lo[c]).max(1.0) / side as f64;
-                tile[c] = (((p[c] - lo[c]) / size) as usize).min(side - 1);
-                distance += (p[c] - lo[c] - (tile[c] as f64 + 0.5) * size).powi(2);
-            }
-            let b = &mut best[tile[1] * side + tile[0]];
-            if distance < b.0 {
-                *b = (distance, k);
-            }
-        }
-        best.into_iter().map(|b| b.1).filter(|&k| k < n).collect()
-    }
-
     /// Tries each seed in each window until one is accepted; returns those accepted. Where next to
     /// none of many seeds succeeds there is nothing to be found, and the rest is not tried.
-    fn search(&mut self, seeds: &[usize], windows: &[Window]) -> Vec<usize> {
+    pub(crate) fn search(&mut self, seeds: &[usize], windows: &[Window]) -> Vec<usize> {
         let mut accepted = Vec::new();
         let searches: Vec<Search> = windows.iter().map(|w| Search::new(&self.solver.layout, w)).collect();
         let mut tried = 0;
@@ -201,7 +111,7 @@ impl<'a> Propagation<'a> {
                     break;
                 }
                 accepted.extend(self.search_each(&left, search, |_| *window));
-                left.retain(|&k| !self.accepted(k));
+                left.retain(|&k| !self.accepted(k) || self.zncc(k) < DOUBTFUL);
             }
             tried += batch.len();
             if tried >= 2 * BATCH && accepted.len() * 20 < tried {
@@ -242,11 +152,22 @@ impl<'a> Propagation<'a> {
         accepted
     }
 
+    fn zncc(&self, k: usize) -> f64 {
+        self.outcomes[k].map_or(f64::NEG_INFINITY, |o| o.zncc)
+    }
+
     /// Stores an outcome unless the point has a better one; whether it was newly accepted.
-    fn keep(&mut self, k: usize, o: Outcome) -> bool {
+    pub(crate) fn keep(&mut self, k: usize, o: Outcome) -> bool {
         let ok = o.status == Status::Converged;
         match &self.outcomes[k] {
-            Some(old) if old.status == Status::Converged || !ok => return false,
+            Some(old) if old.status == Status::Converged => {
+                // a doubtful match gives way to a better one
+                if ok && old.zncc < DOUBTFUL && o.zncc > old.zncc {
+                    self.outcomes[k] = Some(o);
+                }
+                return false;
+            }
+            Some(_) if !ok => return false,
             Some(_) => {}
             None => self.done += 1,
         }
@@ -255,7 +176,7 @@ impl<'a> Propagation<'a> {
     }
 
     /// Solves independent points; returns those accepted, in the order given.
-    fn solve(&mut self, tasks: &[Task]) -> Vec<usize> {
+    pub(crate) fn solve(&mut self, tasks: &[Task]) -> Vec<usize> {
         let (solver, points, observer) = (self.solver, self.points, self.observer);
         let results: Vec<Option<Outcome>> = tasks
             .par_iter()
@@ -276,12 +197,12 @@ impl<'a> Propagation<'a> {
                 accepted.push(task.point);
             }
         }
-        self.report();
+        self.tell();
         accepted
     }
 
     /// Waves from the given points until nothing more is reached.
-    fn spread(&mut self, mut front: Vec<usize>) {
+    pub(crate) fn spread(&mut self, mut front: Vec<usize>) {
         let mut source: Vec<u32> = Vec::new();
         while !front.is_empty() && !self.observer.cancelled() {
             let mut reached: Vec<usize> = Vec::new();
@@ -327,16 +248,20 @@ impl<'a> Propagation<'a> {
         Some(o.warp.moved(f64::from(xb - xa), f64::from(yb - ya)))
     }
 
+    /// Takes over what the start of a run over some of the points (`chosen`) has found.
+    pub(crate) fn inherit(&mut self, other: Propagation<'_>, chosen: &[usize]) {
+        self.globals = other.globals;
+        self.features = other.features;
+        self.report = other.report;
+        for seed in &mut self.report.rejected {
+            seed.point = seed.point.and_then(|k| chosen.get(k).copied());
+        }
+    }
+
     /// Solves what the dense form has left: first the points for which it proposes a start.
-    pub(crate) fn complete(
-        &mut self,
-        proposals: &[(usize, Warp)],
-        guess: &Guess<'_>,
-        sparse: Propagation<'_>,
-    ) {
-        self.globals = sparse.globals;
+    pub(crate) fn complete(&mut self, proposals: &[(usize, Warp)], guess: &Guess<'_>) {
         self.dense = true;
-        self.done = self.outcomes.iter().filter(|o| o.is_some()).count();
+        self.count();
         let mut tasks: Vec<Task> = proposals.iter().map(|&(point, warp)| Task { point, warp }).collect();
         let proposed: HashSet<usize> = proposals.iter().map(|p| p.0).collect();
         for point in 0..self.points.len() {
@@ -372,21 +297,41 @@ impl<'a> Propagation<'a> {
             }
         }
         self.done = self.outcomes.len();
-        self.report();
+        self.tell();
     }
 
     /// Propagation, second attempts, and new seeds where propagation has not come.
     pub(crate) fn finish(&mut self, seeds: Vec<usize>, guess: &Guess<'_>) {
+        let fell_back = || self.report.attempts.iter().any(|a| a.method == StartMethod::Fft);
+        let automatic = match guess {
+            Guess::Auto => true,
+            Guess::Shapes(_) => fell_back(),
+            _ => false,
+        };
         self.spread(seeds);
         self.leaving();
         for apart in [4, 1] {
             let fresh = self.reseed(apart, guess);
-            if fresh.is_empty() {
+            let nothing = fresh.is_empty();
+            self.spread(fresh);
+            let rescued = automatic && self.rescue();
+            if nothing && !rescued {
                 break;
             }
-            self.spread(fresh);
         }
-        let again = self.retry();
+        let mut again = self.retry(0..self.points.len());
+        for _ in 0..RETRIES {
+            if again.is_empty() {
+                break;
+            }
+            // those beside what has just been accepted have a better guess now
+            let mut beside: Vec<usize> =
+                again.iter().flat_map(|&k| self.points.neighbours(k)).map(|&c| c as usize).collect();
+            beside.sort_unstable();
+            beside.dedup();
+            self.spread(again);
+            again = self.retry(beside.into_iter());
+        }
         self.spread(again);
         self.leaving();
     }
@@ -396,6 +341,7 @@ impl<'a> Propagation<'a> {
     /// of the deformed image.
     fn leaving(&mut self) {
         let mut front: Vec<usize> = Vec::new();
+        let mut open = false;
         for k in 0..self.points.len() {
             if self.accepted(k) {
                 continue;
@@ -404,46 +350,93 @@ impl<'a> Propagation<'a> {
             if !self.solver.fits(x, y) {
                 let nowhere = Warp::translation(0.0, 0.0);
                 self.outcomes[k] = Some(Outcome::failed(Status::OutOfImage, nowhere));
-            } else if self.outcomes[k].is_none_or(|o| o.status == Status::NotConverged) {
+                continue;
+            }
+            let outside = self.outcomes[k].is_some_and(|o| o.status == Status::OutOfImage);
+            let own = self.outcomes[k].is_none_or(|o| o.status == Status::NotConverged);
+            open |= own;
+            if own || outside {
                 let near = self.points.neighbours(k).iter().map(|&c| c as usize);
                 front.extend(near.filter(|&c| self.accepted(c)));
             }
         }
+        if !open {
+            front.clear();
+        }
         front.sort_unstable();
         front.dedup();
+        let mut passed = vec![false; if front.is_empty() { 0 } else { self.points.len() }];
         while !front.is_empty() {
             let mut next = Vec::new();
             for &k in &front {
-                let Some(from) = self.outcomes[k] else {
-                    continue;
-                };
                 for &c in self.points.neighbours(k) {
                     let c = c as usize;
-                    let open = self.outcomes[c].is_none_or(|o| o.status == Status::NotConverged);
+                    let outside = self.outcomes[c].is_some_and(|o| o.status == Status::OutOfImage);
+                    let open = outside || self.outcomes[c].is_none_or(|o| o.status == Status::NotConverged);
+                    if !open || passed[c] {
+                        continue;
+                    }
+                    // far away, higher terms lead anywhere
+                    let Some(warp) = self.predicted(k, c).map(|w| w.restricted(Shape::Affine)) else {
+                        continue;
+                    };
                     let ((x, y), _) = self.points.centre(c);
-                    if open && self.solver.leaves(x, y, &from.warp) {
-                        self.outcomes[c] = Some(Outcome::failed(Status::OutOfImage, from.warp));
+                    if outside || self.solver.leaves(x, y, &warp) {
+                        passed[c] = true;
+                        self.outcomes[c] = Some(Outcome::failed(Status::OutOfImage, warp));
                         next.push(c);
                     }
                 }
             }
             front = next;
         }
+        self.count();
+    }
+
+    pub(crate) fn count(&mut self) {
         self.done = self.outcomes.iter().filter(|o| o.is_some()).count();
     }
 
-    /// Points that failed beside accepted ones get a second attempt: from the median of what the
-    /// neighbours predict, after a search of the nearest whole pixels.
-    fn retry(&mut self) -> Vec<usize> {
-        let mut seeds = Vec::new();
-        let mut predictions = Vec::new();
-        for k in 0..self.points.len() {
-            let failed = self.outcomes[k].is_some_and(|o| {
-                matches!(o.status, Status::NotConverged | Status::LowCorrelation | Status::Distorted)
-            });
-            if !failed {
+    /// Points that failed beside accepted ones get a second attempt: from what their neighbour of
+    /// highest ZNCC predicts (they may have begun elsewhere), then from the median of what all
+    /// neighbours predict, after a search of the nearest whole pixels. `candidates` is ascending.
+    fn retry(&mut self, candidates: impl Iterator<Item = usize>) -> Vec<usize> {
+        use Status::{Converged, Distorted, LowCorrelation, NotConverged, OutOfImage};
+        let mut tasks = Vec::new();
+        for k in candidates {
+            let Some(own) = self.outcomes[k] else {
+                continue;
+            };
+            let doubtful = own.status == Converged && own.zncc < DOUBTFUL;
+            if !doubtful && !matches!(own.status, NotConverged | LowCorrelation | Distorted | OutOfImage) {
                 continue;
             }
+            let near = self.points.neighbours(k).iter().map(|&c| c as usize).filter(|&c| self.accepted(c));
+            let best = near.reduce(|a, b| if self.zncc(b) > self.zncc(a) { b } else { a });
+            // where its neighbours are so much better it may be a chance match
+            if doubtful && best.is_none_or(|b| self.zncc(b) <= own.zncc + CLEARLY) {
+                continue;
+            }
+            let ((x, y), _) = self.points.centre(k);
+            if let Some(warp) = best.and_then(|b| self.predicted(b, k))
+                && !self.solver.leaves(x, y, &warp)
+            {
+                tasks.push(Task { point: k, warp });
+            }
+        }
+        let mut found = self.solve(&tasks);
+        let still: Vec<usize> = tasks.iter().map(|t| t.point).filter(|&k| !self.accepted(k)).collect();
+        found.extend(self.retry_search(&still));
+        found.sort_unstable();
+        found
+    }
+
+    /// Searches around the median displacement that the accepted neighbours predict; `failed` is
+    /// ascending.
+    fn retry_search(&mut self, failed: &[usize]) -> Vec<usize> {
+        let mut seeds = Vec::new();
+        let mut predictions = Vec::new();
+        for &k in failed {
             let mut near: Vec<[f64; 2]> = self
                 .points
                 .neighbours(k)
@@ -508,13 +501,15 @@ impl<'a> Propagation<'a> {
         if seeds.is_empty() {
             return Vec::new();
         }
+        let mut found = self.from_features(&seeds);
+        seeds.retain(|&k| !self.accepted(k));
         let windows = match guess {
-            Guess::Search { u, v } => vec![Window {
-                u: (u.0.floor() as i32, u.1.ceil() as i32),
-                v: (v.0.floor() as i32, v.1.ceil() as i32),
-            }],
+            Guess::Search { u, v } => vec![Window::range(*u, *v)],
+            Guess::Features => Vec::new(),
+            _ if self.turned() => Vec::new(),
             _ => self.local_windows(),
         };
-        self.search(&seeds, &windows)
+        found.extend(self.search(&seeds, &windows));
+        found
     }
 }

@@ -214,7 +214,9 @@ impl Dense {
             let buffers = &self.buffers;
             self.shares.par_iter_mut().for_each(|share| {
                 if !observer.cancelled() {
-                    with(buffers, |b| pass.run(solver.level, &share.task, &share.prepared, b, &mut share.out));
+                    with(buffers, |b| {
+                        pass.run(solver.level, &share.task, &share.prepared, b, &mut share.out)
+                    });
                 }
             });
             if observer.cancelled() {

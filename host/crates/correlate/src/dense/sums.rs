@@ -142,41 +142,41 @@ fn add<S: Simd, const N: usize>(s: S, acc: &mut [V<S>; DEGREES], c: &Shift, e: u
     }
 }
 
-    /// Sums of the subsets whose last row of tiles is `b`.
+/// Sums of the subsets whose last row of tiles is `b`.
 #[simd]
 fn down<S: Simd>(s: S, buffers: &mut SumBuffers, tiling: &Tiling, task: &Task, groups: &[Group], b: usize) {
-        let q = tiling.whole().0;
-        let first = b - tiling.last();
-        for m in 0..q {
-            buffers.turned[(first + m) % q] = buffers.shifts[m];
-        }
-        let (w, slot) = (task.width, buffers.subsets.len());
-        let SumBuffers { ring, subsets, turned, .. } = buffers;
-        // a batch of lines shares the loop over the tiles
-        macro_rules! batch {
-            ($n:literal, $planes:expr) => {{
-                let planes: [[usize; BATCH]; $n + 1] = $planes;
-                for k in (0..w).step_by(LANES) {
-                    let mut acc = [[V::splat(s, 0.0); DEGREES]; BATCH];
-                    for (row, c) in ring.chunks_exact(slot).zip(turned.iter()) {
-                        for e in 0..=$n {
-                            for l in 0..BATCH {
-                                let o = planes[e][l] * w + k;
-                                add::<S, $n>(s, &mut acc[l], c, e, V::from_slice(s, &row[o..o + LANES]));
-                            }
-                        }
-                    }
+    let q = tiling.whole().0;
+    let first = b - tiling.last();
+    for m in 0..q {
+        buffers.turned[(first + m) % q] = buffers.shifts[m];
+    }
+    let (w, slot) = (task.width, buffers.subsets.len());
+    let SumBuffers { ring, subsets, turned, .. } = buffers;
+    // a batch of lines shares the loop over the tiles
+    macro_rules! batch {
+        ($n:literal, $planes:expr) => {{
+            let planes: [[usize; BATCH]; $n + 1] = $planes;
+            for k in (0..w).step_by(LANES) {
+                let mut acc = [[V::splat(s, 0.0); DEGREES]; BATCH];
+                for (row, c) in ring.chunks_exact(slot).zip(turned.iter()) {
                     for e in 0..=$n {
                         for l in 0..BATCH {
                             let o = planes[e][l] * w + k;
-                            acc[l][e].store_slice(&mut subsets[o..o + LANES]);
+                            add::<S, $n>(s, &mut acc[l], c, e, V::from_slice(s, &row[o..o + LANES]));
                         }
                     }
                 }
-            }};
-        }
-        each_batch!(groups, |i, e| monomial(i, e), batch);
+                for e in 0..=$n {
+                    for l in 0..BATCH {
+                        let o = planes[e][l] * w + k;
+                        acc[l][e].store_slice(&mut subsets[o..o + LANES]);
+                    }
+                }
+            }
+        }};
     }
+    each_batch!(groups, |i, e| monomial(i, e), batch);
+}
 
 #[simd]
 fn along_x<S: Simd>(

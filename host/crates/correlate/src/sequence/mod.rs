@@ -348,7 +348,7 @@ impl Sequence {
     /// Present reference against the present target.
     fn correlate(&mut self, observer: &dyn Observer) -> Result<Step, SequenceError> {
         let Some(target) = &self.target else {
-            return Ok(Step::new(Correlation { points: Vec::new(), timing: Timing::default() }));
+            return Ok(Step::new(Correlation::default()));
         };
         let chosen: Vec<Option<ShapeParameters>>;
         let (points, starts) = match &self.moved {
@@ -360,7 +360,7 @@ impl Sequence {
         };
         let guess = if starts.iter().any(Option::is_some) { Guess::Shapes(starts) } else { Guess::default() };
         if points.is_empty() {
-            return Ok(Step::new(Correlation { points: Vec::new(), timing: Timing::default() }));
+            return Ok(Step::new(Correlation::default()));
         }
         let memory = &mut self.workspace;
         Ok(Step::new(memory.correlate(&self.reference, target, points, &guess, &self.settings, observer)?))
