@@ -64,6 +64,38 @@ pub enum Error {
         /// Of the image.
         height: u32,
     },
+    /// A file of regions that cannot be read as such.
+    #[error("{}:{line}: {reason}; a region is a [[region]] table with kind = \"rectangle\", \"circle\", \"ellipse\" or \"polygon\"", path.display())]
+    RegionsFile {
+        /// The file.
+        path: PathBuf,
+        /// Line from 1.
+        line: usize,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A region that cannot be used.
+    #[error("{}: {source}", path.display())]
+    Regions {
+        /// The file.
+        path: PathBuf,
+        /// Which field of which region.
+        source: daic_correlate::RegionError,
+    },
+    /// A mask of another size than the images.
+    #[error("the mask {} has {found_width}×{found_height} pixels, the images have {width}×{height}: both must have the same size", path.display())]
+    MaskSize {
+        /// The mask.
+        path: PathBuf,
+        /// Of the mask.
+        found_width: usize,
+        /// Of the mask.
+        found_height: usize,
+        /// Of the images.
+        width: usize,
+        /// Of the images.
+        height: usize,
+    },
     /// An image without contrast.
     #[error("{} is blank: every pixel has grey level {level}; there is nothing to correlate", path.display())]
     Blank {

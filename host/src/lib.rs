@@ -13,6 +13,7 @@
 //! * [`phase`]: phases of gratings and displacements from them.
 //! * [`sequence`]: the same of a series of images.
 
+pub mod area;
 #[cfg(feature = "sim")]
 pub mod demo;
 pub mod doctor;

@@ -1,11 +1,12 @@
 //! 2D-DIC of two images: what `daic correlate` does.
 
+use crate::area::Area;
 use crate::error::Error;
-use crate::measure::{Rectangle, image_of};
+use crate::measure::image_of;
 use crate::progress::Progress;
 use crate::usage::{Clock, Seconds};
 use daic_correlate::{
-    EulerianPoint, Guess, Observer, Point, Points, Reference, Roi, Settings, Stage, StartReport, Target,
+    EulerianPoint, Guess, Observer, Point, Points, Reference, Settings, Stage, StartReport, Target,
 };
 use daic_dataset::{Column, GreyImage, Table};
 use std::sync::Mutex;
@@ -53,7 +54,7 @@ impl PairResult {
     }
 }
 
-/// `x,y,u,v,sigma_u,sigma_v,zncc,iterations,status`, pixels, a row per point.
+/// `x,y,u,v,sigma_u,sigma_v,zncc,iterations,status,solver`, pixels, a row per point.
 ///
 /// # Errors
 /// Only if two columns had one name.
@@ -110,7 +111,8 @@ fn with_status(points: &[Point], status: Vec<String>) -> Result<Table, Error> {
         .with("sigma_v", column(&|p| f64::from(p.sigma_v)))?
         .with("zncc", column(&|p| f64::from(p.zncc)))?
         .with("iterations", Column::I64(iterations))?
-        .with("status", Column::Text(status))?)
+        .with("status", Column::Text(status))?
+        .with("solver", Column::Text(points.iter().map(|p| p.solver.name().to_owned()).collect()))?)
 }
 
 /// Watches the stages to time them, and hands the progress on.
@@ -140,24 +142,24 @@ impl Observer for Watch<'_> {
     }
 }
 
-/// Correlates `deformed` with `reference` on a grid of `step` pixels, beginning with `guess`.
+/// Correlates `deformed` with `reference` on a grid of `step` pixels over `area`, beginning with
+/// `guess`.
 ///
 /// # Errors
-/// A setting or a guess that cannot be used.
+/// A setting, a guess or an area that cannot be used.
 pub fn correlate(
     reference: &GreyImage,
     deformed: &GreyImage,
     settings: &Settings,
     guess: &Guess<'_>,
     step: usize,
-    roi: Option<Rectangle>,
+    area: &Area,
     progress: &dyn Progress,
 ) -> Result<PairResult, Error> {
     let clock = Clock::start();
     let (a, b) = (image_of(reference)?, image_of(deformed)?);
     settings.validate_for(a.width(), a.height())?;
-    let points =
-        Points::grid(a.width(), a.height(), settings.subset, step, &Roi { rectangle: roi, mask: None })?;
+    let points = area.grid(a.width(), a.height(), settings.subset, step)?;
     progress.stage("preparing the images", 0);
     let (subsets, target) = rayon::join(|| Reference::new(a), || Target::new(b, settings.interpolation));
     let prepare = clock.elapsed();

@@ -23,7 +23,7 @@ fn correlate(reference: &Path, deformed: &Path, options: &[&str]) -> Points {
     let answer = daic(folder.path(), arguments).expect_code(0).json();
     let path = folder.path().join("points.csv");
     let text = std::fs::read_to_string(&path).expect("points");
-    assert!(text.starts_with("x,y,u,v,sigma_u,sigma_v,zncc,iterations,status\n"), "{}", &text[..80]);
+    assert!(text.starts_with("x,y,u,v,sigma_u,sigma_v,zncc,iterations,status,solver\n"), "{}", &text[..80]);
     let table = Table::read_csv(&path).expect("points");
     let status = table.texts("status", &path).expect("status");
     let pick = |name| {

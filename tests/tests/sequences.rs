@@ -99,7 +99,7 @@ fn every_update_follows_the_motion() {
         for k in 1..=4 {
             let path = place.path(&out).join(format!("frames/000{k}_f{k}.csv"));
             let text = std::fs::read_to_string(&path).expect("table");
-            assert!(text.starts_with("x,y,u,v,sigma_u,sigma_v,zncc,iterations,status,reference\n"));
+            assert!(text.starts_with("x,y,u,v,sigma_u,sigma_v,zncc,iterations,status,solver,reference\n"));
             let (u, v) = (column(&path, "u"), column(&path, "v"));
             let points = answer["frames"][k - 1]["points"].as_u64().expect("points") as usize;
             let kept = u.len() as f64 / points as f64;

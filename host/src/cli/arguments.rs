@@ -148,6 +148,8 @@ pub struct CorrelateArgs {
     /// material has turned; may be given several times
     #[arg(long, value_name = "X,Y,U,V[,UX,UY,VX,VY]", value_parser = parse_seed, allow_hyphen_values = true)]
     pub seed: Vec<daic_correlate::Seed>,
+    #[command(flatten)]
+    pub area: AreaArgs,
     /// Points to this file (.csv or .npz); of a series, to this folder
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
@@ -205,6 +207,20 @@ pub enum WindowArg {
     BiTriangular,
 }
 
+/// Which pixels are used.
+#[derive(Debug, Args)]
+pub struct AreaArgs {
+    /// Regions to use: a TOML file of [[region]] tables (rectangle, circle, ellipse, polygon)
+    #[arg(long, value_name = "FILE")]
+    pub regions: Option<PathBuf>,
+    /// Mask image of the same size: pixels that are not black are used
+    #[arg(long, value_name = "FILE")]
+    pub mask: Option<PathBuf>,
+    /// Share of a subset that must be inside, 0.1 to 1; default 0.5 with regions or a mask, else 1
+    #[arg(long, value_name = "SHARE")]
+    pub min_inside: Option<f64>,
+}
+
 /// Subset settings; what is not given comes from the optics or experiment file, or the default.
 #[derive(Debug, Args)]
 pub struct DicArgs {
@@ -220,6 +236,17 @@ pub struct DicArgs {
     /// Interpolating B-spline
     #[arg(long)]
     pub interpolation: Option<InterpolationArg>,
+    /// What is minimised
+    #[arg(long)]
+    pub criterion: Option<CriterionArg>,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum CriterionArg {
+    /// Blind to brightness and contrast
+    Znssd,
+    /// Blind to brightness alone
+    Zssd,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]

@@ -1,12 +1,14 @@
 //! What each command does: arguments to facade calls, results to an answer.
 
 use super::arguments::{
-    CorrelateArgs, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, GratingsArg, GuessArg, InitArgs,
-    InterpolationArg, PhaseArgs, ProcessArgs, ProfileArgs, Roi, RunArgs, ShapeArg, UpdateArg, WindowArg,
+    AreaArgs, CorrelateArgs, CriterionArg, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, GratingsArg,
+    GuessArg, InitArgs, InterpolationArg, PhaseArgs, ProcessArgs, ProfileArgs, Roi, RunArgs, ShapeArg,
+    UpdateArg, WindowArg,
 };
 #[cfg(feature = "sim")]
 use super::arguments::{DemoArgs, SimulateArgs};
 use super::output::{Answer, Output};
+use daic::area::{self, Area};
 use daic::measure::{self, Rectangle, Reference};
 use daic::sequence::{self, Description};
 use daic::{
@@ -132,7 +134,8 @@ pub fn correlate(arguments: &CorrelateArgs, output: &Output) -> Result<Answer, E
         GuessArg::Fft => Guess::Fft,
         GuessArg::Features => Guess::Features,
     };
-    let found = pair::correlate(&reference, &deformed, &dic, &guess, step, roi, output)?;
+    let area = area_of(&arguments.area, roi, &reference)?;
+    let found = pair::correlate(&reference, &deformed, &dic, &guess, step, &area, output)?;
     let table = match arguments.description.into() {
         Description::Lagrangian => found.table()?,
         Description::Eulerian => found.eulerian_table()?,
@@ -380,6 +383,17 @@ pub fn rectangle(roi: Roi, image: &GreyImage) -> Result<Rectangle, Error> {
     Ok(Rectangle { x, y, width, height })
 }
 
+fn area_of(arguments: &AreaArgs, roi: Option<Rectangle>, image: &GreyImage) -> Result<Area, Error> {
+    let (width, height) = (image.width as usize, image.height as usize);
+    let drawn = arguments.regions.as_deref().map(|p| area::regions(p, width, height)).transpose()?;
+    let image = arguments.mask.as_deref().map(|p| area::mask(p, width, height)).transpose()?;
+    let mask = match (drawn, image) {
+        (Some(a), Some(b)) => Some(area::both(&a, &b)?),
+        (a, b) => a.or(b),
+    };
+    Ok(Area { roi, mask, min_inside: arguments.min_inside })
+}
+
 pub fn apply(arguments: &DicArgs, settings: &mut daic_correlate::Settings, step: &mut usize) {
     if let Some(subset) = arguments.subset {
         settings.subset = subset as usize;
@@ -389,6 +403,11 @@ pub fn apply(arguments: &DicArgs, settings: &mut daic_correlate::Settings, step:
     }
     if let Some(given) = arguments.shape {
         settings.shape = shape(given);
+    }
+    match arguments.criterion {
+        Some(CriterionArg::Znssd) => settings.criterion = daic_correlate::Criterion::Znssd,
+        Some(CriterionArg::Zssd) => settings.criterion = daic_correlate::Criterion::Zssd,
+        None => {}
     }
     match arguments.interpolation {
         Some(InterpolationArg::Cubic) => settings.interpolation = daic_correlate::Interpolation::Cubic,

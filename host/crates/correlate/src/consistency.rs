@@ -20,8 +20,10 @@ pub(crate) fn judge(solver: &Solver<'_>, points: &Points, outcomes: &mut [Option
     let tolerance = solver.settings.consistency;
     let contradicted: Vec<usize> = (0..outcomes.len())
         .filter(|&k| {
-            // a dense point has been held against the field around it
-            if !accepted(&outcomes[k]) || dense(&outcomes[k]) {
+            // a dense point has been held against the field around it, a split one has been confirmed
+            // by its own side
+            let split = |o: &Option<Outcome>| o.is_some_and(|o| o.solver == SolvedBy::Split);
+            if !accepted(&outcomes[k]) || dense(&outcomes[k]) || split(&outcomes[k]) {
                 return false;
             }
             let (mut asked, mut agree) = (0, 0);

@@ -2,12 +2,14 @@
 
 use crate::consistency;
 use crate::dense::Dense;
+use crate::discontinuity;
+use crate::domain::Domain;
 use crate::icgn::{Outcome, Solver};
 use crate::point::{Point, ShapeParameters, SolvedBy, Status};
 use crate::points::Points;
 use crate::prepared::{Reference, Target};
 use crate::propagate::Propagation;
-use crate::settings::{Interpolation, Settings, SettingsError, SolverChoice};
+use crate::settings::{Criterion, Interpolation, Settings, SettingsError, SolverChoice};
 use crate::simd::dispatch;
 use crate::start::{Seed, StartReport};
 use fearless_simd::{Level, Simd};
@@ -107,6 +109,18 @@ pub enum CorrelateError {
         /// Interpolation in the settings.
         wanted: Interpolation,
     },
+    /// The mask of the points has another size than the images.
+    #[error("the mask has {mask_width}×{mask_height} pixels, the images {width}×{height}")]
+    MaskSize {
+        /// Columns of the mask.
+        mask_width: usize,
+        /// Rows of the mask.
+        mask_height: usize,
+        /// Columns of the images.
+        width: usize,
+        /// Rows of the images.
+        height: usize,
+    },
     /// The list of guesses does not belong to the points.
     #[error("{guesses} initial guesses were given for {points} points")]
     GuessCount {
@@ -204,9 +218,12 @@ impl Workspace {
         check(reference, target, points, guess, settings)?;
         let start = Instant::now();
         observer.stage(Stage::Init);
-        let solver = Solver::new(reference, target, settings, Level::new());
+        let mut solver = Solver::new(reference, target, settings, Level::new());
+        solver.domain = points.domain();
         let mut run = Propagation::new(&solver, points, observer);
-        let dense = settings.solver != SolverChoice::Exact && self.dense.prepare(&solver, points);
+        // the window sums know whole subsets and a free gain alone
+        let plain = points.domain().is_none() && settings.criterion == Criterion::Znssd;
+        let dense = plain && settings.solver != SolverChoice::Exact && self.dense.prepare(&solver, points);
         let sparse = if dense { self.dense.sparse(points) } else { None };
         let Some(sparse) = sparse else {
             return run_exact(run, guess, start);
@@ -294,6 +311,7 @@ pub fn correlate_scalar(
     observer.stage(Stage::Init);
     let mut solver = Solver::new(reference, target, settings, Level::new());
     solver.scalar = true;
+    solver.domain = points.domain();
     run_exact(Propagation::new(&solver, points, observer), guess, start)
 }
 
@@ -316,6 +334,12 @@ fn finished(run: Propagation<'_>, start: Instant, init: Duration) -> Result<Corr
     }
     let mut outcomes = run.outcomes;
     let mut report = run.report;
+    if run.solver.settings.discontinuities {
+        discontinuity::resolve(run.solver, points, &mut outcomes, run.observer);
+        if run.observer.cancelled() {
+            return Err(CorrelateError::Cancelled { done: points.len(), total: points.len() });
+        }
+    }
     consistency::judge(run.solver, points, &mut outcomes);
     let points: Vec<Point> = outcomes.iter().enumerate().map(|(k, o)| point(points, k, o.as_ref())).collect();
     let settings = run.solver.settings;
@@ -346,6 +370,12 @@ fn check(
         });
     }
     settings.validate_for(a.width(), a.height())?;
+    if let Some((mask_width, mask_height)) = points.domain().map(Domain::size)
+        && (mask_width, mask_height) != (a.width(), a.height())
+    {
+        let (width, height) = (a.width(), a.height());
+        return Err(CorrelateError::MaskSize { mask_width, mask_height, width, height });
+    }
     if target.interpolation != settings.interpolation {
         return Err(CorrelateError::Interpolation {
             prepared: target.interpolation,

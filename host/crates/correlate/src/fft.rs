@@ -2,7 +2,7 @@
 
 use crate::icgn::{Scratch, Solver};
 use crate::image::Image;
-use crate::subset::{LANES, Layout, Subset};
+use crate::subset::{LANES, Layout};
 use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
 use rustfft::{Fft, FftPlanner, num_complex::Complex32};
 use std::sync::Arc;
@@ -95,6 +95,11 @@ impl Fft2 {
         out
     }
 
+    /// Correlation of two planes given by their spectra, not divided by the number of values.
+    fn correlated(&self, template: &[Complex32], area: &[Complex32]) -> Vec<f32> {
+        self.plane(template.iter().zip(area).map(|(t, a)| t.conj() * a).collect())
+    }
+
     /// Inverse of [`Fft2::spectrum`], not divided by the number of values.
     fn plane(&self, mut spectrum: Vec<Complex32>) -> Vec<f32> {
         let (half, ny) = (self.half(), self.ny);
@@ -159,27 +164,34 @@ impl Search {
         copy_area(target, offset, left, top, cols, rows, nx, &mut area);
         let (sum, square) = integrals(&area, nx, cols, rows);
         let mut template = vec![0.0f32; nx * ny];
-        unpack(layout, subset, nx, &mut template);
-        let a = self.fft.spectrum(&mut area);
-        let mut product = self.fft.spectrum(&mut template);
-        for (t, s) in product.iter_mut().zip(&a) {
-            *t = t.conj() * s;
-        }
-        let map = self.fft.plane(product);
+        unpack(layout, &subset.f, nx, &mut template);
         let scale = 1.0 / (nx * ny) as f64;
-        let n = layout.count() as f64;
+        // under a cut subset the sums of the target have to be correlations too
+        let under = (!subset.cut.is_empty()).then(|| {
+            let mut cut = vec![0.0f32; nx * ny];
+            unpack(layout, &subset.cut, nx, &mut cut);
+            let cut = self.fft.spectrum(&mut cut);
+            let mut square: Vec<f32> = area.iter().map(|g| g * g).collect();
+            let square = self.fft.correlated(&cut, &self.fft.spectrum(&mut square));
+            let values = self.fft.correlated(&cut, &self.fft.spectrum(&mut area.clone()));
+            (values, square)
+        });
+        let a = self.fft.spectrum(&mut area);
+        let map = self.fft.correlated(&self.fft.spectrum(&mut template), &a);
+        let n = subset.count as f64;
         let w = layout.width;
+        let [x0, x1, y0, y1] = subset.extent.map(|e| e as i32 + r);
         let stride = cols + 1;
         let mut best: Option<(i32, i32, f64)> = None;
         let (iw, ih) = (target.width() as i32, target.height() as i32);
         for j in 0..self.size.1 {
             let py = top + j as i32;
-            if py < 0 || py + w as i32 > ih {
+            if py + y0 < 0 || py + y1 >= ih {
                 continue;
             }
             for i in 0..self.size.0 {
                 let px = left + i as i32;
-                if px < 0 || px + w as i32 > iw {
+                if px + x0 < 0 || px + x1 >= iw {
                     continue;
                 }
                 let over = |s: &[f64]| {
@@ -187,8 +199,13 @@ impl Search {
                         - s[j * stride + i + w]
                         - s[(j + w) * stride + i]
                 };
-                let s = over(&sum);
-                let variance = over(&square) - s * s / n;
+                let (s, q) = match &under {
+                    None => (over(&sum), over(&square)),
+                    Some((sum, square)) => {
+                        (f64::from(sum[j * nx + i]) * scale, f64::from(square[j * nx + i]) * scale)
+                    }
+                };
+                let variance = q - s * s / n;
                 // a flat target subset correlates with nothing
                 if variance <= 1e-6 * subset.sff {
                     continue;
@@ -251,14 +268,14 @@ fn integrals(area: &[f32], nx: usize, cols: usize, rows: usize) -> (Vec<f64>, Ve
     (sum, square)
 }
 
-fn unpack(layout: &Layout, subset: &Subset, stride: usize, out: &mut [f32]) {
+fn unpack(layout: &Layout, packed: &[f32], stride: usize, out: &mut [f32]) {
     let row_floats = layout.groups * LANES;
     let used = row_floats.min(layout.width);
     for d in 0..layout.width {
-        out[d * stride..d * stride + used].copy_from_slice(&subset.f[d * row_floats..d * row_floats + used]);
+        out[d * stride..d * stride + used].copy_from_slice(&packed[d * row_floats..d * row_floats + used]);
         for c in 0..layout.columns {
             let at = layout.width * row_floats + c * layout.column_groups() * LANES;
-            out[d * stride + row_floats + c] = subset.f[at + d];
+            out[d * stride + row_floats + c] = packed[at + d];
         }
     }
 }

@@ -1,6 +1,8 @@
 //! Inverse-compositional Gauss–Newton for one point (Pan, Li & Tong, Exp. Mech. 53 (2013) 1277;
-//! second order: Gao et al., Opt. Lasers Eng. 65 (2015) 73), criterion ZNSSD.
+//! second order: Gao et al., Opt. Lasers Eng. 65 (2015) 73), criterion ZNSSD or ZSSD.
 
+use crate::damped::descend;
+use crate::domain::{Coverage, Cut, Domain, extent};
 use crate::kernel::{Sampling, Sums, sweep};
 use crate::noise::NoiseGain;
 use crate::normal::{MAX, Normal};
@@ -8,7 +10,7 @@ use crate::plane::PAD;
 use crate::point::{SolvedBy, Status};
 use crate::prepared::{Reference, Target};
 use crate::scalar;
-use crate::settings::{Interpolation, Settings};
+use crate::settings::{Criterion, Interpolation, Settings};
 use crate::shape::{Shape, Warp};
 use crate::simd::dispatch;
 use crate::subset::{Layout, Subset};
@@ -17,7 +19,7 @@ use fearless_simd_macros::simd;
 
 /// How far, in pixels, the iteration may overhang the deformed image before it is given up; the
 /// padding holds mirrored grey levels there.
-const OVERHANG: f64 = (PAD - 12) as f64;
+pub(crate) const OVERHANG: f64 = (PAD - 12) as f64;
 /// How far a converged subset may overhang: half a pixel, so that noise does not decide on
 /// subsets which touch the border.
 const BORDER: f64 = 0.5;
@@ -32,6 +34,8 @@ pub(crate) struct Solver<'a> {
     pub(crate) level: Level,
     /// Uses the scalar reference implementation instead of the vector kernels.
     pub(crate) scalar: bool,
+    /// Pixels that subsets may use; `None`: all of the image, and whole subsets only.
+    pub(crate) domain: Option<&'a Domain>,
 }
 
 /// Memory of one thread, used again for every point.
@@ -39,7 +43,10 @@ pub(crate) struct Solver<'a> {
 pub(crate) struct Scratch {
     pub(crate) subset: Subset,
     normal: Option<Normal>,
-    warped: Vec<f32>,
+    pub(crate) warped: Vec<f32>,
+    cut: Cut,
+    /// How the last subset fitted.
+    pub(crate) fit: Fit,
 }
 
 /// What the iteration left.
@@ -86,14 +93,34 @@ impl<'a> Solver<'a> {
             noise: NoiseGain::of(target.interpolation),
             level,
             scalar: false,
+            domain: None,
         }
     }
 
-    /// Whether the subset around (x, y) lies in the reference image.
-    pub(crate) fn fits(&self, x: i32, y: i32) -> bool {
+    /// How much of the subset around (x, y) may be used.
+    fn coverage(&self, x: i32, y: i32) -> Coverage {
         let r = self.layout.radius as i32;
+        if let Some(domain) = self.domain {
+            return domain.coverage(x, y, r);
+        }
         let (w, h) = (self.reference.image.width(), self.reference.image.height());
-        x >= r && y >= r && x + r < w as i32 && y + r < h as i32
+        let whole = x >= r && y >= r && x + r < w as i32 && y + r < h as i32;
+        if whole { Coverage::Whole } else { Coverage::Outside }
+    }
+
+    /// Whether the subset around (x, y), or enough of it, lies where it may.
+    pub(crate) fn fits(&self, x: i32, y: i32) -> bool {
+        self.coverage(x, y) != Coverage::Outside
+    }
+
+    /// Fills in which pixels of the subset around (x, y) are used; whether there are enough.
+    fn cut(&self, x: i32, y: i32, cut: &mut Cut) -> bool {
+        cut.clear();
+        let coverage = self.coverage(x, y);
+        if let (Coverage::Cut, Some(domain)) = (coverage, self.domain) {
+            domain.cut(x, y, self.layout.radius as i32, cut);
+        }
+        coverage != Coverage::Outside
     }
 
     /// Optimises the subset around pixel (x, y) from `guess`; uncertainties are stated at
@@ -105,15 +132,67 @@ impl<'a> Solver<'a> {
         offset: [f64; 2],
         guess: &Warp,
     ) -> Outcome {
-        if !self.fits(x, y) {
+        if !self.cut(x, y, &mut scratch.cut) {
             return Outcome::failed(Status::OutOfImage, *guess);
+        }
+        self.optimise(scratch, (x, y), offset, guess)
+    }
+
+    /// As [`Solver::solve`] with a part of the subset, given row by row.
+    pub(crate) fn solve_part(
+        &self,
+        scratch: &mut Scratch,
+        (x, y): (i32, i32),
+        offset: [f64; 2],
+        guess: &Warp,
+        part: &[bool],
+    ) -> Outcome {
+        if !self.cut(x, y, &mut scratch.cut) {
+            return Outcome::failed(Status::OutOfImage, *guess);
+        }
+        if scratch.cut.is_empty() {
+            scratch.cut.extend_from_slice(part);
+        } else {
+            scratch.cut.iter_mut().zip(part).for_each(|(c, p)| *c &= p);
+        }
+        // the scratch knows subsets by their centre alone
+        scratch.subset.centre = None;
+        let out = self.optimise(scratch, (x, y), offset, guess);
+        scratch.subset.centre = None;
+        out
+    }
+
+    /// Warps the subset around (x, y) without optimising; the scratch keeps it and the interpolated
+    /// grey levels. Nothing where it does not lie in the images or is flat.
+    pub(crate) fn look(&self, scratch: &mut Scratch, (x, y): (i32, i32), warp: &Warp) -> Option<Fit> {
+        if !self.cut(x, y, &mut scratch.cut) {
+            return None;
         }
         use Interpolation::{Cubic, Quintic};
         use Shape::{Affine, Quadratic, Translation};
         let l = self.level;
         macro_rules! run {
             ($n:literal, $n1:literal, $o:literal) => {
-                dispatch!(l, s => iterate::<_, $n, $n1, $o>(s, self, scratch, x, y, offset, guess))
+                dispatch!(l, s => look::<_, $n, $n1, $o>(s, self, scratch, x, y, warp))
+            };
+        }
+        match (self.target.interpolation, self.settings.shape) {
+            (Quintic, Translation) => run!(6, 7, 0),
+            (Quintic, Affine) => run!(6, 7, 1),
+            (Quintic, Quadratic) => run!(6, 7, 2),
+            (Cubic, Translation) => run!(4, 5, 0),
+            (Cubic, Affine) => run!(4, 5, 1),
+            (Cubic, Quadratic) => run!(4, 5, 2),
+        }
+    }
+
+    fn optimise(&self, scratch: &mut Scratch, (x, y): (i32, i32), offset: [f64; 2], guess: &Warp) -> Outcome {
+        use Interpolation::{Cubic, Quintic};
+        use Shape::{Affine, Quadratic, Translation};
+        let l = self.level;
+        macro_rules! run {
+            ($n:literal, $n1:literal, $o:literal) => {
+                dispatch!(l, s => attempt::<_, $n, $n1, $o>(s, self, scratch, x, y, offset, guess))
             };
         }
         match (self.target.interpolation, self.settings.shape) {
@@ -131,6 +210,7 @@ impl<'a> Solver<'a> {
         if scratch.subset.centre == Some((x, y)) {
             return;
         }
+        self.cut(x, y, &mut scratch.cut);
         dispatch!(self.level, s => load_translation(s, self, scratch, x, y));
         // only the moments of order 0 were summed: the iteration must load again
         scratch.normal = None;
@@ -139,14 +219,26 @@ impl<'a> Solver<'a> {
 
     /// Whether the subset around (x, y), displaced by `warp`, clearly leaves the deformed image.
     pub(crate) fn leaves(&self, x: i32, y: i32, warp: &Warp) -> bool {
-        !self.inside(x, y, warp, 2.0)
+        let r = self.layout.radius as f64;
+        let mut cut = Cut::new();
+        self.cut(x, y, &mut cut);
+        let used = if cut.is_empty() { [-r, r, -r, r] } else { extent(&cut, self.layout.radius) };
+        !self.inside(x, y, used, warp, 2.0)
     }
 
-    /// Whether the warped subset stays within `margin` pixels of the deformed image.
-    fn inside(&self, x: i32, y: i32, warp: &Warp, margin: f64) -> bool {
-        let r = self.layout.radius as f64;
+    /// Whether the warped subset, of which the box `[ξ0, ξ1, η0, η1]` is used, stays within `margin`
+    /// pixels of the deformed image.
+    pub(crate) fn inside(
+        &self,
+        x: i32,
+        y: i32,
+        [x0, x1, y0, y1]: [f64; 4],
+        warp: &Warp,
+        margin: f64,
+    ) -> bool {
         let w = self.target.image.width() as f64 - 1.0 + margin;
         let h = self.target.image.height() as f64 - 1.0 + margin;
+        let r = self.layout.radius as f64;
         // most subsets are far from every edge
         let reach = |c: &[f64; 6]| {
             let [_, a, b, d, e, f] = c.map(f64::abs);
@@ -160,8 +252,8 @@ impl<'a> Solver<'a> {
         if place(x, u[0], reach(u), w) && place(y, v[0], reach(v), h) {
             return true;
         }
-        [-r, 0.0, r].iter().all(|&eta| {
-            [-r, 0.0, r].iter().all(|&xi| {
+        [y0, 0.5 * (y0 + y1), y1].iter().all(|&eta| {
+            [x0, 0.5 * (x0 + x1), x1].iter().all(|&xi| {
                 let d = warp.at(xi, eta);
                 let (px, py) = (f64::from(x) + xi + d[0], f64::from(y) + eta + d[1]);
                 px >= -margin && py >= -margin && px <= w && py <= h
@@ -194,7 +286,7 @@ impl<'a> Solver<'a> {
         numbers: &Numbers,
     ) -> Result<(f64, [f32; 2]), Status> {
         let independent = self.independent(numbers);
-        if !self.inside(x, y, warp, BORDER) {
+        if !self.inside(x, y, numbers.extent, warp, BORDER) {
             Err(Status::OutOfImage)
         } else if !self.clears(numbers.zncc, independent) {
             Err(Status::LowCorrelation)
@@ -209,23 +301,26 @@ impl<'a> Solver<'a> {
     /// (autocorrelation exp(−d²/2s²) each, s² = Σf²/Σf_x²) have a ZNCC of variance π s_x s_y / n
     /// over n pixels.
     fn independent(&self, numbers: &Numbers) -> f64 {
-        let n = self.layout.count() as f64;
+        let n = numbers.count;
         let [gxx, gyy] = numbers.energy.map(|e| e.max(f64::MIN_POSITIVE));
         n * (gxx * gyy).sqrt() / (std::f64::consts::PI * numbers.sff)
     }
 
-    /// Standard uncertainties of u and v; gain and offset of the grey levels are free.
+    /// Standard uncertainties of u and v; the offset of the grey levels is free, and so is their gain
+    /// unless the criterion fixes it.
     fn sigma(&self, warp: &Warp, numbers: &Numbers) -> [f32; 2] {
-        let n = self.layout.count() as f64;
+        let n = numbers.count;
         let r = self.layout.radius as f64;
         let m = self.settings.shape.parameters_per_component();
-        let Numbers { sff, energy, variance, zncc, gain } = *numbers;
+        let Numbers { energy, variance, gain, left, .. } = *numbers;
         // variance of the residual f − gain g if both images had the noise of whole pixels
         let (residual, noise_f) = match self.settings.noise {
             Some(s) => (s * s * (1.0 + gain * gain), s * s),
             None => {
-                let freedom = (n - 2.0 - 2.0 * m as f64).max(1.0);
-                let raw = 2.0 * sff * (1.0 - zncc).max(0.0) / freedom;
+                // offset, and gain where it is free
+                let levels = if self.settings.criterion == Criterion::Znssd { 2.0 } else { 1.0 };
+                let freedom = (n - levels - 2.0 * m as f64).max(1.0);
+                let raw = left.max(0.0) / freedom;
                 // the same noise in the grey levels of both images
                 let gain2 = gain * gain;
                 let s2 = raw * (1.0 + gain2) / (1.0 + gain2 * self.noise.interpolated_over(warp, r));
@@ -247,7 +342,8 @@ impl<'a> Solver<'a> {
     }
 
     /// Variances of u and v at an offset from the centre per unit of residual variance, from the
-    /// inverse normal matrix; gain and offset of the grey levels are free.
+    /// inverse normal matrix; the offset of the grey levels is free, and so is their gain unless the
+    /// criterion fixes it.
     fn variance(&self, subset: &Subset, normal: &Normal, offset: [f64; 2]) -> [f64; 2] {
         let r = self.layout.radius as f64;
         let m = self.settings.shape.parameters_per_component();
@@ -262,13 +358,19 @@ impl<'a> Solver<'a> {
             b[c * m..c * m + m].copy_from_slice(&basis[..m]);
             let own = normal.quadratic_form(b);
             let through_gain: f64 = b.iter().zip(&coupled).map(|(a, e)| a * e).sum();
-            own + through_gain * through_gain / subset.sff
+            match self.settings.criterion {
+                Criterion::Znssd => own + through_gain * through_gain / subset.sff,
+                Criterion::Zssd => own,
+            }
         })
     }
 }
 
 /// What a verdict on a subset rests on.
 pub(crate) struct Numbers {
+    /// Pixels used, and their bounding box: smallest and largest ξ and η.
+    pub(crate) count: f64,
+    pub(crate) extent: [f64; 4],
     /// Σ (f − mean)².
     pub(crate) sff: f64,
     /// Σ fx², Σ fy².
@@ -278,11 +380,76 @@ pub(crate) struct Numbers {
     pub(crate) zncc: f64,
     /// From deformed to reference grey levels.
     pub(crate) gain: f64,
+    /// Σ of the squared residuals.
+    pub(crate) left: f64,
 }
 
 #[simd]
 fn load_translation<S: Simd>(s: S, solver: &Solver<'_>, scratch: &mut Scratch, x: i32, y: i32) {
-    scratch.subset.load::<S, 0>(s, &solver.layout, solver.reference, x, y);
+    scratch.subset.load::<S, 0>(s, &solver.layout, solver.reference, x, y, &scratch.cut);
+}
+
+/// Packs the subset around (x, y) with its normal matrix, unless the scratch holds it already.
+#[simd]
+fn load<S: Simd, const O: usize>(s: S, solver: &Solver<'_>, scratch: &mut Scratch, x: i32, y: i32) {
+    if scratch.subset.centre == Some((x, y)) {
+        return;
+    }
+    let Scratch { subset, cut, .. } = scratch;
+    if solver.scalar {
+        scalar::load(subset, &solver.layout, solver.reference, x, y, O, cut);
+    } else {
+        subset.load::<S, O>(s, &solver.layout, solver.reference, x, y, cut);
+    }
+    let m = solver.settings.shape.parameters_per_component();
+    scratch.normal = Normal::new(subset, m, subset.count as f64);
+}
+
+#[simd]
+fn look<S: Simd, const N: usize, const N1: usize, const O: usize>(
+    s: S,
+    solver: &Solver<'_>,
+    scratch: &mut Scratch,
+    x: i32,
+    y: i32,
+    warp: &Warp,
+) -> Option<Fit> {
+    load::<S, O>(s, solver, scratch, x, y);
+    let Scratch { subset, warped, .. } = scratch;
+    let warp = warp.restricted(solver.settings.shape);
+    if !solver.inside(x, y, subset.extent, &warp, OVERHANG) {
+        return None;
+    }
+    let sums = residuals::<S, N, N1, O>(s, solver, subset, warped, x, y, &warp);
+    Fit::new(subset, &sums, solver.settings.criterion)
+}
+
+/// Gauss–Newton, and from the same guess Levenberg–Marquardt and Gauss–Newton where it diverges.
+#[simd]
+fn attempt<S: Simd, const N: usize, const N1: usize, const O: usize>(
+    s: S,
+    solver: &Solver<'_>,
+    scratch: &mut Scratch,
+    x: i32,
+    y: i32,
+    offset: [f64; 2],
+    guess: &Warp,
+) -> Outcome {
+    let plain = iterate::<S, N, N1, O>(s, solver, scratch, x, y, offset, guess);
+    let diverged = match plain.status {
+        Status::NotConverged | Status::Distorted => true,
+        Status::OutOfImage => plain.iterations > 0,
+        _ => false,
+    };
+    if !(diverged && solver.settings.fallback) {
+        return plain;
+    }
+    let Some((near, sweeps)) = descend::<S, N, N1, O>(s, solver, scratch, x, y, guess) else {
+        return plain;
+    };
+    let mut again = iterate::<S, N, N1, O>(s, solver, scratch, x, y, offset, &near);
+    again.iterations += sweeps;
+    if again.status == Status::Converged { again } else { plain }
 }
 
 #[simd]
@@ -298,30 +465,22 @@ fn iterate<S: Simd, const N: usize, const N1: usize, const O: usize>(
     let settings = solver.settings;
     let layout = &solver.layout;
     let m = settings.shape.parameters_per_component();
-    let n = layout.count() as f64;
     let r = layout.radius as f64;
     let mut warp = guess.restricted(settings.shape);
-    if scratch.subset.centre != Some((x, y)) {
-        if solver.scalar {
-            scalar::load(&mut scratch.subset, layout, solver.reference, x, y, O);
-        } else {
-            scratch.subset.load::<S, O>(s, layout, solver.reference, x, y);
-        }
-        scratch.normal = Normal::new(&scratch.subset, m, n);
-    }
-    let subset = &scratch.subset;
+    load::<S, O>(s, solver, scratch, x, y);
+    let Scratch { subset, normal, warped, fit, .. } = scratch;
     // rounding of single precision over the subset's grey range
-    let floor = 1e-10 * n * subset.mean * subset.mean;
+    let floor = 1e-10 * subset.count as f64 * subset.mean * subset.mean;
     if subset.sff <= floor {
         return Outcome::failed(Status::LowTexture, warp);
     }
-    let Some(normal) = &scratch.normal else {
+    let Some(normal) = normal else {
         return Outcome::failed(Status::Singular, warp);
     };
     let mut out = Outcome::failed(Status::NotConverged, warp);
-    let mut gain = 1.0;
+    *fit = Fit::default();
     while u32::from(out.iterations) < settings.max_iterations {
-        if !solver.inside(x, y, &warp, OVERHANG) {
+        if !solver.inside(x, y, subset.extent, &warp, OVERHANG) {
             out.status = Status::OutOfImage;
             break;
         }
@@ -329,27 +488,13 @@ fn iterate<S: Simd, const N: usize, const N1: usize, const O: usize>(
         if far > r {
             break;
         }
-        let base = [warp.0[0][0].round(), warp.0[1][0].round()];
-        let mut at = Sampling {
-            x: x + base[0] as i32,
-            y: y + base[1] as i32,
-            u: warp.0[0],
-            v: warp.0[1],
-            mean: (subset.mean - f64::from(solver.target.offset)) as f32,
-        };
-        at.u[0] -= base[0];
-        at.v[0] -= base[1];
-        let plane = &solver.target.coefficients;
-        let sums = if solver.scalar {
-            scalar::sweep(layout, subset, plane, &at, N, O)
-        } else {
-            sweep::<S, N, N1, O>(s, layout, subset, plane, &at, &mut scratch.warped)
-        };
-        let Some((increment, zncc, a)) = step(subset, normal, &sums, m, n, r) else {
+        let sums = residuals::<S, N, N1, O>(s, solver, subset, warped, x, y, &warp);
+        let Some(f) = Fit::new(subset, &sums, settings.criterion) else {
             break;
         };
-        out.zncc = zncc;
-        gain = a;
+        let increment = increment(subset, normal, &sums, &f, m, r);
+        *fit = f;
+        out.zncc = f.zncc;
         out.iterations += 1;
         let Some(next) = warp.updated(&increment) else {
             break;
@@ -363,11 +508,14 @@ fn iterate<S: Simd, const N: usize, const N1: usize, const O: usize>(
     out.warp = warp;
     if out.status == Status::Converged {
         let numbers = Numbers {
+            count: subset.count as f64,
+            extent: subset.extent,
             sff: subset.sff,
             energy: [subset.products[0][0], subset.products[2][0]],
             variance: solver.variance(subset, normal, offset),
-            zncc: out.zncc,
-            gain,
+            zncc: fit.zncc,
+            gain: fit.gain,
+            left: fit.energy,
         };
         match solver.verdict((x, y), &warp, &numbers) {
             Ok((independent, sigma)) => (out.independent, out.sigma) = (independent, sigma),
@@ -377,23 +525,78 @@ fn iterate<S: Simd, const N: usize, const N1: usize, const O: usize>(
     out
 }
 
+/// Sums of the residual with the subset warped.
+#[simd]
+pub(crate) fn residuals<S: Simd, const N: usize, const N1: usize, const O: usize>(
+    s: S,
+    solver: &Solver<'_>,
+    subset: &Subset,
+    warped: &mut Vec<f32>,
+    x: i32,
+    y: i32,
+    warp: &Warp,
+) -> Sums {
+    let base = [warp.0[0][0].round(), warp.0[1][0].round()];
+    let mut at = Sampling {
+        x: x + base[0] as i32,
+        y: y + base[1] as i32,
+        u: warp.0[0],
+        v: warp.0[1],
+        mean: (subset.mean - f64::from(solver.target.offset)) as f32,
+    };
+    at.u[0] -= base[0];
+    at.v[0] -= base[1];
+    let plane = &solver.target.coefficients;
+    if solver.scalar {
+        scalar::sweep(&solver.layout, subset, plane, &at, N, O, warped)
+    } else {
+        sweep::<S, N, N1, O>(s, &solver.layout, subset, plane, &at, warped)
+    }
+}
+
 /// ZNCC that lies `sigmas` standard deviations above chance (Fisher's z).
 pub(crate) fn significant(sigmas: f64, independent: f64) -> f64 {
     (sigmas / (independent - 3.0).max(1.0).sqrt()).tanh()
 }
 
-/// Increment in pixels, ZNCC before it, and the gain from deformed to reference grey levels.
-fn step(subset: &Subset, normal: &Normal, sums: &Sums, m: usize, n: f64, r: f64) -> Option<(Warp, f64, f64)> {
-    let mean = sums.q / n;
-    let sff = subset.sff;
-    let sfg = sff - sums.fq;
-    let sgg = sff - 2.0 * sums.fq + (sums.qq - sums.q * mean);
-    if !(sgg > 1e-9 * sff && sgg.is_finite()) {
-        return None;
+/// How well the warped subset fits, and the grey levels that fit it best.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Fit {
+    pub(crate) zncc: f64,
+    /// From deformed to reference grey levels.
+    pub(crate) gain: f64,
+    /// Mean of the residual f − g.
+    pub(crate) mean: f64,
+    /// Σ (f − f̄ − gain (g − ḡ))²: what is minimised, in grey levels.
+    pub(crate) energy: f64,
+}
+
+impl Fit {
+    /// `None` where the warped subset is flat.
+    pub(crate) fn new(subset: &Subset, sums: &Sums, criterion: Criterion) -> Option<Self> {
+        let mean = sums.q / subset.count as f64;
+        let sff = subset.sff;
+        let sfg = sff - sums.fq;
+        let sqq = sums.qq - sums.q * mean;
+        let sgg = sff - 2.0 * sums.fq + sqq;
+        if !(sgg > 1e-9 * sff && sgg.is_finite()) {
+            return None;
+        }
+        let zncc = sfg / (sff * sgg).sqrt();
+        Some(match criterion {
+            // Ratio of the standard deviations, not the regression of f on g: noise in g biases the
+            // latter.
+            Criterion::Znssd => {
+                Self { zncc, gain: (sff / sgg).sqrt(), mean, energy: 2.0 * sff * (1.0 - zncc) }
+            }
+            Criterion::Zssd => Self { zncc, gain: 1.0, mean, energy: sqq },
+        })
     }
-    // Ratio of the standard deviations, not the regression of f on g: noise in g biases the latter.
-    let gain = (sff / sgg).sqrt();
-    let zncc = sfg / (sff * sgg).sqrt();
+}
+
+/// Increment in pixels.
+pub(crate) fn increment(subset: &Subset, normal: &Normal, sums: &Sums, fit: &Fit, m: usize, r: f64) -> Warp {
+    let Fit { gain, mean, .. } = *fit;
     let mut b = [0.0; MAX];
     for c in 0..2 {
         for k in 0..m {
@@ -410,11 +613,11 @@ fn step(subset: &Subset, normal: &Normal, sums: &Sums, m: usize, n: f64, r: f64)
             w[c][k] = -d[c * m + k] / scale[k];
         }
     }
-    Some((Warp(w), zncc, gain))
+    Warp(w)
 }
 
 /// Norm of an increment as a motion of the subset's edge.
-fn edge_motion(increment: &Warp, r: f64) -> f64 {
+pub(crate) fn edge_motion(increment: &Warp, r: f64) -> f64 {
     let scale = [1.0, r, r, r * r, r * r, r * r];
     increment.0.iter().flat_map(|c| c.iter().zip(&scale).map(|(a, s)| (a * s).powi(2))).sum::<f64>().sqrt()
 }

@@ -214,6 +214,7 @@ impl Mask {
 }
 
 /// Sums of a mask over any rectangle in constant time.
+#[derive(Debug)]
 pub(crate) struct MaskSums {
     stride: usize,
     sums: Vec<u32>,

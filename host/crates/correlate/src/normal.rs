@@ -20,6 +20,11 @@ impl Normal {
     /// Normal matrix of a subset, m parameters per component, mean removed; `None` where it is not
     /// safely positive definite.
     pub(crate) fn new(subset: &Subset, m: usize, pixels: f64) -> Option<Self> {
+        Self::factor(Self::matrix(subset, m, pixels), 2 * m)
+    }
+
+    /// Lower triangle of that matrix.
+    pub(crate) fn matrix(subset: &Subset, m: usize, pixels: f64) -> [[f64; MAX]; MAX] {
         let n = 2 * m;
         let mut h = [[0.0; MAX]; MAX];
         for a in 0..n {
@@ -30,10 +35,12 @@ impl Normal {
                     - subset.slopes[ca][a % m] * subset.slopes[cb][b % m] / pixels;
             }
         }
-        Self::factor(h, n)
+        h
     }
 
-    fn factor(mut l: [[f64; MAX]; MAX], n: usize) -> Option<Self> {
+    /// Cholesky factor of the first n rows and columns; `None` where they are not safely positive
+    /// definite.
+    pub(crate) fn factor(mut l: [[f64; MAX]; MAX], n: usize) -> Option<Self> {
         for j in 0..n {
             let original = l[j][j];
             let mut d = original;

@@ -57,13 +57,16 @@ pub enum Status {
     Distorted,
     /// The neighbours contradict this point.
     Inconsistent,
+    /// The subset straddles a step, a crack or the edge of an object, and the point's own side of it
+    /// could not be solved.
+    Discontinuous,
     /// No initial guess was found.
     NoGuess,
 }
 
 impl Status {
     /// Every status.
-    pub const ALL: [Status; 9] = [
+    pub const ALL: [Status; 10] = [
         Status::Converged,
         Status::NotConverged,
         Status::OutOfImage,
@@ -72,6 +75,7 @@ impl Status {
         Status::Singular,
         Status::Distorted,
         Status::Inconsistent,
+        Status::Discontinuous,
         Status::NoGuess,
     ];
 
@@ -86,6 +90,7 @@ impl Status {
             Status::Singular => "singular",
             Status::Distorted => "distorted",
             Status::Inconsistent => "inconsistent",
+            Status::Discontinuous => "discontinuous",
             Status::NoGuess => "no_guess",
         }
     }
@@ -131,7 +136,7 @@ pub struct Point {
     /// Zero-normalised cross-correlation of the subset, −1…1; NaN where unknown. The ZNSSD
     /// criterion is 2 (1 − zncc).
     pub zncc: f32,
-    /// Gauss–Newton iterations of the final attempt.
+    /// Sweeps over the subset of the final attempt, Levenberg–Marquardt included.
     pub iterations: u16,
     /// Verdict. Where it is not `Converged`, u, v and the rest are what the last attempt left, for
     /// diagnosis only.

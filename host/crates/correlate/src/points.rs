@@ -1,6 +1,8 @@
 //! Points of interest: a regular grid over a region, or a scattered list; and who neighbours whom.
 
-use crate::image::{Mask, MaskSums};
+use crate::domain::{Coverage, Domain};
+use crate::image::Mask;
+use std::sync::Arc;
 use thiserror::Error;
 
 /// Rectangle of pixels: columns `x..x + width`, rows `y..y + height`.
@@ -18,8 +20,9 @@ pub struct Rectangle {
 
 /// Region of interest in the reference image.
 ///
-/// The rectangle limits the *centres* of the subsets, the mask limits their *pixels*: a subset is
-/// used only if all of it lies in the image and in the mask.
+/// The rectangle limits the *centres* of the subsets, the mask limits their *pixels*. With
+/// [`Points::grid`] a subset is used only if all of it lies in the image and in the mask; with
+/// [`Points::grid_cut`] what is inside is used.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Roi<'a> {
     /// Where subset centres may lie; `None`: the whole image.
@@ -73,6 +76,14 @@ pub enum PointsError {
         /// Largest coordinate accepted.
         limit: f64,
     },
+    /// The share of a subset that must be inside is none.
+    #[error("the share of a subset that must be inside, {value}, is outside {min}..=1")]
+    MinInside {
+        /// Value given.
+        value: f64,
+        /// Smallest accepted.
+        min: f64,
+    },
     /// More points than can be indexed.
     #[error("{count} points are more than the {limit} that can be treated at once")]
     TooMany {
@@ -123,6 +134,14 @@ pub struct Points {
     grid: Option<Grid>,
     starts: Vec<u32>,
     neighbours: Vec<u32>,
+    domain: Option<Arc<Domain>>,
+}
+
+/// What a grid does with subsets that are not all inside.
+#[derive(Clone, Copy, PartialEq)]
+enum Edge {
+    Whole,
+    Cut(f64),
 }
 
 impl Points {
@@ -148,6 +167,51 @@ impl Points {
         step: usize,
         roi: &Roi<'_>,
     ) -> Result<Self, PointsError> {
+        let points = Self::lay_out(width, height, subset, step, roi, Edge::Whole)?;
+        // whole subsets need no mask any more
+        Ok(Self { domain: None, ..points })
+    }
+
+    /// Smallest share of a subset that [`Points::grid_cut`] and [`Points::within`] accept.
+    pub const MIN_INSIDE: f64 = 0.1;
+
+    /// As [`Points::grid`], with subsets that are cut: of a subset only the pixels in the mask and at
+    /// least [`Points::BORDER`] clear of the image's edge are used. Nodes whose centre pixel may be
+    /// used, and at least the share `min_inside` (0.1 to 1) of all pixels of their subset, are
+    /// points. The nodes are those of [`Points::grid`], and more around them.
+    ///
+    /// # Errors
+    /// [`PointsError`].
+    pub fn grid_cut(
+        width: usize,
+        height: usize,
+        subset: usize,
+        step: usize,
+        roi: &Roi<'_>,
+        min_inside: f64,
+    ) -> Result<Self, PointsError> {
+        Self::lay_out(width, height, subset, step, roi, Edge::Cut(min_inside))
+    }
+
+    /// Lets subsets use only the pixels of a mask: subsets are cut by it and by the image's edge, as
+    /// in [`Points::grid_cut`]. Points that keep less than `min_inside` of their subset come back as
+    /// [`Status::OutOfImage`](crate::Status::OutOfImage).
+    ///
+    /// # Errors
+    /// [`PointsError::MinInside`].
+    pub fn within(self, mask: &Mask, min_inside: f64) -> Result<Self, PointsError> {
+        let domain = Some(Arc::new(Domain::new(clear_of_edge(mask), checked(min_inside)?)));
+        Ok(Self { domain, ..self })
+    }
+
+    fn lay_out(
+        width: usize,
+        height: usize,
+        subset: usize,
+        step: usize,
+        roi: &Roi<'_>,
+        edge: Edge,
+    ) -> Result<Self, PointsError> {
         if step == 0 {
             return Err(PointsError::ZeroStep);
         }
@@ -170,24 +234,38 @@ impl Points {
             });
         }
         let r = subset / 2;
-        let reach = r + Self::BORDER;
+        let whole = r + Self::BORDER;
+        let (reach, min_inside) = match edge {
+            Edge::Whole => (whole, 1.0),
+            Edge::Cut(min_inside) => (Self::BORDER, checked(min_inside)?),
+        };
         let nodes = |start: usize, len: usize, size: usize| {
-            let first = start.max(reach);
+            let mut first = start.max(reach);
+            if first < whole {
+                // the nodes of whole subsets are among those of cut ones
+                first += (start.max(whole) - first) % step;
+            }
             let end = (start + len).min(size.saturating_sub(reach));
             (first, end.saturating_sub(first).div_ceil(step))
         };
         let (x0, columns) = nodes(rect.x, rect.width, width);
         let (y0, rows) = nodes(rect.y, rect.height, height);
-        let sums = roi.mask.map(MaskSums::new);
+        let domain = match (edge, roi.mask) {
+            (Edge::Whole, None) => None,
+            (Edge::Whole, Some(m)) => Some(Domain::new(m.clone(), min_inside)),
+            (Edge::Cut(_), Some(m)) => Some(Domain::new(clear_of_edge(m), min_inside)),
+            (Edge::Cut(_), None) => {
+                let all = Mask::from_parts(width, height, vec![true; width * height]);
+                Some(Domain::new(clear_of_edge(&all), min_inside))
+            }
+        };
         let mut xy = Vec::new();
         let mut index = vec![NONE; columns * rows];
         for j in 0..rows {
             for i in 0..columns {
                 let (x, y) = (x0 + i * step, y0 + j * step);
-                let whole = ((2 * r + 1) * (2 * r + 1)) as u32;
-                let inside =
-                    sums.as_ref().is_none_or(|s| s.count(x - r, y - r, x + r + 1, y + r + 1) == whole);
-                if inside {
+                let coverage = |d: &Domain| d.coverage(x as i32, y as i32, r as i32);
+                if domain.as_ref().is_none_or(|d| coverage(d) != Coverage::Outside) {
                     index[j * columns + i] = xy.len() as u32;
                     xy.push([x as f64, y as f64]);
                 }
@@ -212,7 +290,7 @@ impl Points {
                 starts.push(neighbours.len() as u32);
             }
         }
-        Ok(Self { xy, grid: Some(grid), starts, neighbours })
+        Ok(Self { xy, grid: Some(grid), starts, neighbours, domain: domain.map(Arc::new) })
     }
 
     /// Scattered points at any sub-pixel positions. The subset of a point is centred at the nearest
@@ -232,14 +310,14 @@ impl Points {
             return Err(PointsError::Position { index, limit });
         }
         let (starts, neighbours) = nearest(&xy);
-        Ok(Self { xy, grid: None, starts, neighbours })
+        Ok(Self { xy, grid: None, starts, neighbours, domain: None })
     }
 
     /// Some of the points, with neighbours of their own.
     pub(crate) fn selected(&self, which: &[usize]) -> Self {
         let xy: Vec<[f64; 2]> = which.iter().map(|&k| self.xy[k]).collect();
         let (starts, neighbours) = nearest(&xy);
-        Self { xy, grid: None, starts, neighbours }
+        Self { xy, grid: None, starts, neighbours, domain: self.domain.clone() }
     }
 
     /// Number of points.
@@ -267,6 +345,11 @@ impl Points {
         &self.neighbours[self.starts[k] as usize..self.starts[k + 1] as usize]
     }
 
+    /// Pixels that subsets may use, where subsets are cut.
+    pub(crate) fn domain(&self) -> Option<&Domain> {
+        self.domain.as_deref()
+    }
+
     /// Centre pixel of the subset of point k and the offset of the point from it.
     pub(crate) fn centre(&self, k: usize) -> ((i32, i32), [f64; 2]) {
         let [x, y] = self.xy[k];
@@ -276,6 +359,27 @@ impl Points {
         let (cx, cy) = (x.round(), y.round());
         ((cx as i32, cy as i32), [x - cx, y - cy])
     }
+}
+
+fn checked(min_inside: f64) -> Result<f64, PointsError> {
+    if (Points::MIN_INSIDE..=1.0).contains(&min_inside) {
+        Ok(min_inside)
+    } else {
+        Err(PointsError::MinInside { value: min_inside, min: Points::MIN_INSIDE })
+    }
+}
+
+/// The mask without the image's outermost pixels.
+fn clear_of_edge(mask: &Mask) -> Mask {
+    let (w, h) = (mask.width(), mask.height());
+    let b = Points::BORDER;
+    let inside = (0..w * h)
+        .map(|k| {
+            let (x, y) = (k % w, k / w);
+            mask.pixels()[k] && x >= b && y >= b && x + b < w && y + b < h
+        })
+        .collect();
+    Mask::from_parts(w, h, inside)
 }
 
 /// Nodes adjacent to (i, j), the four nearest first.

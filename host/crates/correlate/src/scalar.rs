@@ -4,18 +4,7 @@
 use crate::kernel::{Sampling, Sums};
 use crate::plane::{PAD, Plane};
 use crate::prepared::Reference;
-use crate::subset::{LANES, Layout, Subset, monomial};
-
-/// Position of pixel (column i, row d) of the subset in its packed form.
-fn place(layout: &Layout, i: usize, d: usize) -> usize {
-    let row_floats = layout.groups * LANES;
-    if layout.columns > 0 && i >= row_floats {
-        let c = i - row_floats;
-        (layout.width * layout.groups + c * layout.column_groups()) * LANES + d
-    } else {
-        d * row_floats + i
-    }
-}
+use crate::subset::{Layout, Subset, monomial};
 
 fn powers(order: usize, xi: f64, eta: f64) -> [f64; 15] {
     let mut p = [0.0; 15];
@@ -35,28 +24,31 @@ pub(crate) fn load(
     x: i32,
     y: i32,
     order: usize,
+    cut: &[bool],
 ) {
     let r = layout.radius as i32;
     let width = layout.width;
-    let total = (width * layout.groups + layout.columns * layout.column_groups()) * LANES;
+    let total = layout.floats();
     *subset = Subset::default();
+    subset.select(layout, cut);
     subset.f = vec![0.0; total];
     subset.gx = vec![0.0; total];
     subset.gy = vec![0.0; total];
-    let n = layout.count() as f64;
+    let n = subset.count as f64;
+    let used = |i: usize, d: usize| cut.get(d * width + i).copied().unwrap_or(true);
     let grey =
         |i: usize, d: usize| f64::from(reference.image.row((y - r) as usize + d)[(x - r) as usize + i]);
     for d in 0..width {
-        for i in 0..width {
+        for i in (0..width).filter(|&i| used(i, d)) {
             subset.mean += grey(i, d) / n;
         }
     }
     for d in 0..width {
-        for i in 0..width {
+        for i in (0..width).filter(|&i| used(i, d)) {
             let f = grey(i, d) - subset.mean;
             let o = reference.gx.index(x - r + i as i32, y - r + d as i32);
             let g = [reference.gx.data[o], reference.gy.data[o]];
-            let k = place(layout, i, d);
+            let k = layout.place(i, d);
             subset.f[k] = f as f32;
             subset.gx[k] = g[0];
             subset.gy[k] = g[1];
@@ -116,7 +108,9 @@ pub(crate) fn sweep(
     at: &Sampling,
     taps: usize,
     order: usize,
+    warped: &mut Vec<f32>,
 ) -> Sums {
+    warped.resize(layout.floats(), 0.0);
     let r = layout.radius as f64;
     let mut sums = Sums::default();
     for d in 0..layout.width {
@@ -126,7 +120,11 @@ pub(crate) fn sweep(
             let sum = |c: &[f64; 6]| -> f64 { c.iter().zip(&p).map(|(a, b)| a * b).sum() };
             let g =
                 sample(plane, taps, f64::from(at.x) + xi + sum(&at.u), f64::from(at.y) + eta + sum(&at.v));
-            let k = place(layout, i, d);
+            let k = layout.place(i, d);
+            if subset.cut.get(k) == Some(&0.0) {
+                continue;
+            }
+            warped[k] = g as f32;
             let f = f64::from(subset.f[k]);
             let q = f - (g - f64::from(at.mean));
             sums.q += q;

@@ -57,8 +57,14 @@ pub struct Settings {
     /// The iteration stops when the increment moves no pixel on the subset's edge by more than
     /// about this many pixels.
     pub tolerance: f64,
-    /// Iterations after which a point counts as not converged.
+    /// Iterations after which an attempt counts as not converged.
     pub max_iterations: u32,
+    /// Whether points where Gauss–Newton diverges or reaches the cap are tried again by
+    /// Levenberg–Marquardt.
+    pub fallback: bool,
+    /// Whether points whose subset straddles a step, a crack or the edge of an object are looked for
+    /// and solved again with their own side of it.
+    pub discontinuities: bool,
     /// Zero-normalised cross-correlation below which a point is not accepted, whatever its
     /// statistical significance.
     pub min_zncc: f64,
@@ -85,6 +91,8 @@ impl Default for Settings {
             solver: SolverChoice::Auto,
             tolerance: 1e-3,
             max_iterations: 30,
+            fallback: true,
+            discontinuities: true,
             min_zncc: 0.5,
             significance: 5.0,
             max_log_stretch: 0.4,

@@ -1,5 +1,6 @@
 //! One reference subset, packed for streaming, with the moments that make its normal equations.
 
+use crate::domain::extent;
 use crate::prepared::Reference;
 use crate::sampler::V;
 use fearless_simd::prelude::*;
@@ -47,8 +48,19 @@ impl Layout {
         self.width.div_ceil(LANES)
     }
 
-    fn floats(&self) -> usize {
+    pub(crate) fn floats(&self) -> usize {
         (self.width * self.groups + self.columns * self.column_groups()) * LANES
+    }
+
+    /// Position of pixel (column i, row d) of the subset in its packed form.
+    pub(crate) fn place(&self, i: usize, d: usize) -> usize {
+        let row_floats = self.groups * LANES;
+        if i >= row_floats {
+            let c = i - row_floats;
+            (self.width * self.groups + c * self.column_groups()) * LANES + d
+        } else {
+            d * row_floats + i
+        }
     }
 }
 
@@ -59,13 +71,19 @@ pub(crate) const fn monomial(i: usize, j: usize) -> usize {
 }
 
 /// A reference subset: grey levels minus their mean and the gradients, group after group; unused
-/// lanes are zero. Coordinates in the moments are ξ/r and η/r.
+/// lanes and the pixels that a cut leaves out are zero. Coordinates in the moments are ξ/r and η/r.
 #[derive(Default, Clone)]
 pub(crate) struct Subset {
     pub(crate) centre: Option<(i32, i32)>,
     pub(crate) f: Vec<f32>,
     pub(crate) gx: Vec<f32>,
     pub(crate) gy: Vec<f32>,
+    /// 1 for a used pixel, 0 for one left out, packed likewise; empty for a whole subset.
+    pub(crate) cut: Vec<f32>,
+    /// Pixels used.
+    pub(crate) count: usize,
+    /// Bounding box of the pixels used: smallest and largest ξ and η.
+    pub(crate) extent: [f64; 4],
     pub(crate) mean: f64,
     /// Σ (f − mean)².
     pub(crate) sff: f64,
@@ -78,8 +96,8 @@ pub(crate) struct Subset {
 }
 
 impl Subset {
-    /// Copies the subset around (x, y), which must lie in the image, and sums its moments for a
-    /// shape function of order O.
+    /// Copies the subset around (x, y) and sums its moments for a shape function of order O. Its
+    /// centre, and all of a whole subset or the used pixels of a cut one, must lie in the image.
     #[inline(always)]
     pub(crate) fn load<S: Simd, const O: usize>(
         &mut self,
@@ -88,10 +106,16 @@ impl Subset {
         reference: &Reference,
         x: i32,
         y: i32,
+        cut: &[bool],
     ) {
-        self.copy(s, layout, reference, x, y);
+        self.select(layout, cut);
+        if cut.is_empty() {
+            self.copy(s, layout, reference, x, y);
+        } else {
+            self.copy_cut(layout, reference, x, y, cut);
+        }
         let zero = V::splat(s, 0.0);
-        let n = layout.count() as f64;
+        let n = self.count as f64;
         let mut sum = zero;
         for c in self.f.chunks_exact(LANES) {
             sum += V::from_slice(s, c);
@@ -100,8 +124,46 @@ impl Subset {
         let shift = f64::from(sum.reduce_sum()) / n;
         self.mean += shift;
         self.subtract(s, layout, shift as f32);
+        if !cut.is_empty() {
+            self.f.iter_mut().zip(&self.cut).for_each(|(f, c)| *f *= c);
+        }
         self.moments::<S, O>(s, layout);
         self.centre = Some((x, y));
+    }
+
+    /// Notes which pixels are used.
+    pub(crate) fn select(&mut self, layout: &Layout, cut: &[bool]) {
+        self.cut.clear();
+        if cut.is_empty() {
+            let r = layout.radius as f64;
+            self.extent = [-r, r, -r, r];
+            self.count = layout.count();
+            return;
+        }
+        self.cut.resize(layout.floats(), 0.0);
+        for (k, _) in cut.iter().enumerate().filter(|c| *c.1) {
+            self.cut[layout.place(k % layout.width, k / layout.width)] = 1.0;
+        }
+        self.extent = extent(cut, layout.radius);
+        self.count = cut.iter().filter(|&&c| c).count();
+    }
+
+    fn copy_cut(&mut self, layout: &Layout, reference: &Reference, x: i32, y: i32, cut: &[bool]) {
+        for v in [&mut self.f, &mut self.gx, &mut self.gy] {
+            v.clear();
+            v.resize(layout.floats(), 0.0);
+        }
+        let r = layout.radius as i32;
+        let centre = reference.image.row(y as usize)[x as usize];
+        self.mean = f64::from(centre);
+        for (k, _) in cut.iter().enumerate().filter(|c| *c.1) {
+            let (i, d) = (k % layout.width, k / layout.width);
+            let (a, b) = (x - r + i as i32, y - r + d as i32);
+            let (at, o) = (layout.place(i, d), reference.gx.index(a, b));
+            self.f[at] = reference.image.row(b as usize)[a as usize] - centre;
+            self.gx[at] = reference.gx.data[o];
+            self.gy[at] = reference.gy.data[o];
+        }
     }
 
     #[inline(always)]

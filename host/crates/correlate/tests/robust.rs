@@ -284,6 +284,7 @@ fn statuses_have_stable_names() {
             "singular",
             "distorted",
             "inconsistent",
+            "discontinuous",
             "no_guess"
         ]
     );

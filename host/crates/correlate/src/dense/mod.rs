@@ -430,7 +430,17 @@ impl Dense {
         }
         let variance = [f64::from(constant(layout.variance(0))), f64::from(constant(layout.variance(1)))];
         let centre = ((tiling.x0 + i * tiling.step) as i32, (tiling.y0 + j * tiling.step) as i32);
-        let numbers = crate::icgn::Numbers { sff, energy, variance, zncc, gain };
+        let r = solver.layout.radius as f64;
+        let numbers = crate::icgn::Numbers {
+            count: solver.layout.count() as f64,
+            extent: [-r, r, -r, r],
+            sff,
+            energy,
+            variance,
+            zncc,
+            gain,
+            left: 2.0 * sff * (1.0 - zncc),
+        };
         match solver.verdict(centre, &warp, &numbers) {
             Ok((_, sigma)) if !negligible(distance, sigma) => (None, Some(warp)),
             Ok((independent, sigma)) => {
