@@ -239,6 +239,19 @@ pub struct DicArgs {
     /// What is minimised
     #[arg(long)]
     pub criterion: Option<CriterionArg>,
+    /// Which form of the optimisation solves the points (default: auto)
+    #[arg(long)]
+    pub solver: Option<SolverArg>,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum SolverArg {
+    /// Dense where it agrees with exact, exact everywhere else
+    Auto,
+    /// All overlapping subsets at once; points where that is not valid have no result
+    Dense,
+    /// Every subset by its own iteration
+    Exact,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]

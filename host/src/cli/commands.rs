@@ -3,7 +3,7 @@
 use super::arguments::{
     AreaArgs, CorrelateArgs, CriterionArg, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, GratingsArg,
     GuessArg, InitArgs, InterpolationArg, PhaseArgs, ProcessArgs, ProfileArgs, Roi, RunArgs, ShapeArg,
-    UpdateArg, WindowArg,
+    SolverArg, UpdateArg, WindowArg,
 };
 #[cfg(feature = "sim")]
 use super::arguments::{DemoArgs, SimulateArgs};
@@ -403,6 +403,12 @@ pub fn apply(arguments: &DicArgs, settings: &mut daic_correlate::Settings, step:
     }
     if let Some(given) = arguments.shape {
         settings.shape = shape(given);
+    }
+    match arguments.solver {
+        Some(SolverArg::Auto) => settings.solver = daic_correlate::SolverChoice::Auto,
+        Some(SolverArg::Dense) => settings.solver = daic_correlate::SolverChoice::Dense,
+        Some(SolverArg::Exact) => settings.solver = daic_correlate::SolverChoice::Exact,
+        None => {}
     }
     match arguments.criterion {
         Some(CriterionArg::Znssd) => settings.criterion = daic_correlate::Criterion::Znssd,

@@ -3,6 +3,7 @@
 
 pub mod guard;
 mod kernels;
+mod live;
 mod measure;
 mod page;
 mod pyvale;
@@ -42,6 +43,7 @@ pub struct Findings {
     /// pyvale's points, as score.py sees them.
     peer_scores: Vec<Value>,
     kernels: Vec<kernels::Kernel>,
+    live: Vec<live::Live>,
     /// What was not measured, and why.
     remarks: Vec<String>,
 }
@@ -128,6 +130,14 @@ pub fn correlate(quick: bool) -> Report {
     report.step("two threads beside one", || outcome(measurement.threads(&mut findings)));
     report.step("sizes of the image", || outcome(measurement.sizes(&mut findings)));
     report.step("memory", || outcome(measurement.memory(&mut findings)));
+    report.step("live: two views to height maps", || match &measurement.golden {
+        Some(dir) => outcome(live::measure(dir, &mut findings)),
+        None => {
+            let why = "no golden frames (set DAIC_SHARED to where golden/ is)".to_owned();
+            findings.remarks.push(format!("live was not measured: {why}"));
+            Outcome::NotRun(why)
+        }
+    });
     report.step("errors on known fields", || match &measurement.golden {
         Some(dir) => outcome(measurement.accuracy(dir, peer.as_deref(), &mut findings)),
         None => {

@@ -221,15 +221,16 @@ impl Workspace {
         let mut solver = Solver::new(reference, target, settings, Level::new());
         solver.domain = points.domain();
         let mut run = Propagation::new(&solver, points, observer);
-        // the window sums know whole subsets and a free gain alone
-        let plain = points.domain().is_none() && settings.criterion == Criterion::Znssd;
-        let dense = plain && settings.solver != SolverChoice::Exact && self.dense.prepare(&solver, points);
+        // the window sums know a free gain alone
+        let plain = settings.criterion == Criterion::Znssd;
+        let dense = plain && self.dense.prepare(&solver, points);
         let sparse = if dense { self.dense.sparse(points) } else { None };
         let Some(sparse) = sparse else {
             return run_exact(run, guess, start);
         };
         let loose = Settings { tolerance: settings.tolerance.max(LOOSE), ..settings.clone() };
-        let solver_sparse = Solver::new(reference, target, &loose, Level::new());
+        let mut solver_sparse = Solver::new(reference, target, &loose, Level::new());
+        solver_sparse.domain = points.domain();
         let few = points.selected(&sparse.points);
         let quiet = Quiet(observer);
         let mut first = Propagation::new(&solver_sparse, &few, &quiet);
@@ -243,8 +244,15 @@ impl Workspace {
         first.finish(seeds, &guess_sparse);
         let init = start.elapsed();
         observer.stage(Stage::Solve);
-        let proposals =
-            self.dense.solve(&solver, points, &sparse, &first.outcomes, &mut run.outcomes, observer);
+        let proposals = self.dense.solve(
+            &solver,
+            points,
+            &sparse,
+            &first.outcomes,
+            &mut run.outcomes,
+            settings.solver != SolverChoice::Exact,
+            observer,
+        );
         run.inherit(first, &sparse.points);
         if settings.solver == SolverChoice::Dense {
             run.give_up(&proposals);

@@ -98,7 +98,7 @@ impl<'a> Solver<'a> {
     }
 
     /// How much of the subset around (x, y) may be used.
-    fn coverage(&self, x: i32, y: i32) -> Coverage {
+    pub(crate) fn coverage(&self, x: i32, y: i32) -> Coverage {
         let r = self.layout.radius as i32;
         if let Some(domain) = self.domain {
             return domain.coverage(x, y, r);

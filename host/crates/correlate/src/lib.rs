@@ -1,13 +1,4 @@
-//! Two-dimensional digital image correlation.
-//!
-//! Plain arrays in, results out: subset correlation by inverse-compositional Gauss–Newton with the
-//! zero-normalised sum of squared differences, B-spline interpolation, initial guesses that reach
-//! across half the image, a status and an uncertainty for every point.
-//!
-//! Strain, virtual extensometers and probes on the result are in [`strain`].
-//!
-//! Conventions: pixel (0, 0) has its centre at (0, 0), x to the right, y down; displacements are
-//! Lagrangian, in pixels.
+#![doc = include_str!("../README.md")]
 #![forbid(unsafe_code)]
 #![allow(clippy::needless_range_loop)] // index loops are what the vector kernels are made of
 

@@ -164,7 +164,8 @@ mod tests {
     fn interpolated_noise_is_whole_at_pixels_and_less_between() {
         for kind in [Interpolation::Cubic, Interpolation::Quintic] {
             let g = NoiseGain::new(kind);
-            assert!((g.interpolated(3.0, -2.0) - 1.0).abs() < 1e-4);
+            // what the series leaves out: 3e-4 per axis for the cubic, 3e-6 for the quintic
+            assert!((g.interpolated(3.0, -2.0) - 1.0).abs() < 1e-3);
             let half = g.interpolated(0.5, 0.0);
             assert!(half > 0.6 && half < 0.9, "{half}");
             assert!((g.interpolated(0.3, 0.0) - g.interpolated(0.7, 0.0)).abs() < 1e-9);

@@ -25,7 +25,7 @@ pub enum SolverChoice {
     Auto,
     /// The dense form alone: points where it is not valid are reported as such.
     Dense,
-    /// Every point by its own Gauss–Newton iteration.
+    /// Every point by its own Gauss–Newton iteration; on a grid the dense form gives the start.
     Exact,
 }
 

@@ -13,6 +13,7 @@ mod tiling;
 mod warp;
 
 use crate::correlate::Observer;
+use crate::domain::Coverage;
 use crate::icgn::{Outcome, Solver};
 use crate::point::{SolvedBy, Status};
 use crate::points::{Grid, Points};
@@ -181,8 +182,9 @@ impl Dense {
     }
 
     /// Two passes from the sparse outcomes, in the order of [`Sparse::points`]. Accepted points are
-    /// written to `outcomes`; others that have a usable result get it as a proposal. Nothing happens
+    /// written to `outcomes`, if `accept`; others that have a usable result get it as a proposal. Nothing happens
     /// where no sparse point was accepted.
+    #[allow(clippy::too_many_arguments)]
     pub(crate) fn solve(
         &mut self,
         solver: &Solver<'_>,
@@ -190,6 +192,7 @@ impl Dense {
         sparse: &Sparse,
         start: &[Option<Outcome>],
         outcomes: &mut [Option<Outcome>],
+        accept: bool,
         observer: &dyn Observer,
     ) -> Vec<(usize, Warp)> {
         let Some(Key { tiling, order, .. }) = self.key else {
@@ -224,7 +227,7 @@ impl Dense {
             }
             observer.points(points.len() * (number + 1) / (PASSES + 1), points.len());
         }
-        self.collect(solver, points, &tiling, order, outcomes)
+        self.collect(solver, points, &tiling, order, accept, outcomes)
     }
 
     /// The sparse lattice without gaps: nodes without an accepted point take what their neighbours
@@ -337,6 +340,7 @@ impl Dense {
         points: &Points,
         tiling: &Tiling,
         order: usize,
+        accept: bool,
         outcomes: &mut [Option<Outcome>],
     ) -> Vec<(usize, Warp)> {
         let Some(grid) = points.as_grid() else {
@@ -369,7 +373,8 @@ impl Dense {
                     };
                     let share = &self.shares[j / task_rows * across + i / columns];
                     let (column, line) = (i - share.task.column, j - share.task.row);
-                    match self.outcome(solver, tiling, share, order, column, line) {
+                    let judged = self.outcome(solver, tiling, share, order, accept, column, line);
+                    match judged {
                         (Some(o), _) => row[k - first] = Some(o),
                         (None, Some(w)) => proposals.push((k, w)),
                         (None, None) => {}
@@ -382,12 +387,14 @@ impl Dense {
     }
 
     #[inline(always)]
+    #[allow(clippy::too_many_arguments)]
     fn outcome(
         &self,
         solver: &Solver<'_>,
         tiling: &Tiling,
         share: &Share,
         order: usize,
+        accept: bool,
         column: usize,
         row: usize,
     ) -> (Option<Outcome>, Option<Warp>) {
@@ -425,12 +432,15 @@ impl Dense {
         }
         let sff = f64::from(constant(layout.sff()));
         let energy = [f64::from(constant(layout.energy(0))), f64::from(constant(layout.energy(1)))];
-        if !(distance < LINEAR && sff > 0.0) {
+        if !(accept && distance < LINEAR && sff > 0.0) {
             return (None, Some(warp));
         }
         let variance = [f64::from(constant(layout.variance(0))), f64::from(constant(layout.variance(1)))];
         let centre = ((tiling.x0 + i * tiling.step) as i32, (tiling.y0 + j * tiling.step) as i32);
         let r = solver.layout.radius as f64;
+        if !matches!(solver.coverage(centre.0, centre.1), Coverage::Whole) {
+            return (None, Some(warp));
+        }
         let numbers = crate::icgn::Numbers {
             count: solver.layout.count() as f64,
             extent: [-r, r, -r, r],
