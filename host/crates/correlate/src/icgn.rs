@@ -313,30 +313,30 @@ impl<'a> Solver<'a> {
         let r = self.layout.radius as f64;
         let m = self.settings.shape.parameters_per_component();
         let Numbers { energy, variance, gain, left, .. } = *numbers;
-        // variance of the residual f − gain g if both images had the noise of whole pixels
-        let (residual, noise_f) = match self.settings.noise {
-            Some(s) => (s * s * (1.0 + gain * gain), s * s),
+        let gain2 = gain * gain;
+        // share of the noise that the interpolation of the deformed image lets through
+        let passed = self.noise.interpolated_over(warp, r);
+        // variance of the noise of one image, the same in both
+        let noise = match self.settings.noise {
+            Some(s) => s * s,
             None => {
                 // offset, and gain where it is free
                 let levels = if self.settings.criterion == Criterion::Znssd { 2.0 } else { 1.0 };
                 let freedom = (n - levels - 2.0 * m as f64).max(1.0);
-                let raw = left.max(0.0) / freedom;
-                // the same noise in the grey levels of both images
-                let gain2 = gain * gain;
-                let s2 = raw * (1.0 + gain2) / (1.0 + gain2 * self.noise.interpolated_over(warp, r));
-                (s2, s2 / (1.0 + gain2))
+                left.max(0.0) / freedom / (1.0 + gain2 * passed)
             }
         };
         let mut out = [f32::NAN; 2];
         for (c, o) in out.iter_mut().enumerate() {
-            // Noise in the gradients makes the normal matrix look better than it is: with H the one
-            // seen and H₀ = H (1 − excess) the true one, the variance is s² (H₀ + H) / 2 / H₀². Only
-            // the deformed image's noise meets that of the gradients at random; the reference's own
-            // product f f_x sums to nothing.
-            let excess = n * self.noise.gradient * noise_f / energy[c];
-            let honest = (1.0 - excess).max(0.2);
-            let loss = 0.5 * (1.0 + honest) / (honest * honest);
-            *o = (residual * loss * variance[c]).max(0.0).sqrt() as f32;
+            // Noise in the gradients makes the normal matrix H look better than it is: the true one is
+            // H₀ = H (1 − excess). The right-hand side is Σ G (n_f − gain n_g). The reference's own
+            // product of noise and gradient noise sums to nothing, which leaves s² H₀. The deformed
+            // image's noise meets true gradients, which lie where the spline passes all, and those of
+            // noise, of which it passes what it passes of white noise (to 0.3 % of it; cubic: 6 %).
+            let excess = (n * self.noise.gradient * noise / energy[c]).min(0.8);
+            let honest = 1.0 - excess;
+            let right = honest + gain2 * (honest + excess * passed);
+            *o = (noise * variance[c] * right).max(0.0).sqrt() as f32 / honest as f32;
         }
         out
     }
