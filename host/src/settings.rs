@@ -15,6 +15,7 @@ pub fn measure_settings(processing: &Processing) -> measure::Settings {
             interpolation: match processing.interpolation {
                 experiment::Interpolation::Cubic => daic_correlate::Interpolation::Cubic,
                 experiment::Interpolation::Quintic => daic_correlate::Interpolation::Quintic,
+                experiment::Interpolation::Septic => daic_correlate::Interpolation::Septic,
             },
             tolerance: processing.convergence,
             max_iterations: processing.max_iterations,

@@ -282,6 +282,7 @@ pub enum ShapeArg {
 pub enum InterpolationArg {
     Cubic,
     Quintic,
+    Septic,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]

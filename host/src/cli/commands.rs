@@ -418,6 +418,7 @@ pub fn apply(arguments: &DicArgs, settings: &mut daic_correlate::Settings, step:
     match arguments.interpolation {
         Some(InterpolationArg::Cubic) => settings.interpolation = daic_correlate::Interpolation::Cubic,
         Some(InterpolationArg::Quintic) => settings.interpolation = daic_correlate::Interpolation::Quintic,
+        Some(InterpolationArg::Septic) => settings.interpolation = daic_correlate::Interpolation::Septic,
         None => {}
     }
 }

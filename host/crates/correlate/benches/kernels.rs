@@ -29,7 +29,11 @@ fn bench(shape: Shape) -> Bench {
 fn planes(c: &mut Criterion) {
     let mut b = bench(Shape::Affine);
     c.benchmark_group("image 512²: load").bench_function("simd", |t| t.iter(|| b.load_plane()));
-    for (name, kind) in [("cubic", Interpolation::Cubic), ("quintic", Interpolation::Quintic)] {
+    for (name, kind) in [
+        ("cubic", Interpolation::Cubic),
+        ("quintic", Interpolation::Quintic),
+        ("septic", Interpolation::Septic),
+    ] {
         c.benchmark_group(format!("image 512²: load and prefilter, {name}"))
             .bench_function("simd", |t| t.iter(|| b.prefilter(kind)));
     }

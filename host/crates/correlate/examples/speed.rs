@@ -1,5 +1,5 @@
-//! Points per second of a correlation: `speed REF DEF [subset] [step] [order] [csv] [repeats] [exact|dense|auto]`, one
-//! thread. Everything from the 8-bit pixels on is counted.
+//! Points per second of a correlation: `speed REF DEF [subset] [step] [order] [csv] [repeats] [exact|dense|auto]
+//! [cubic|quintic|septic]`, one thread. Everything from the 8-bit pixels on is counted.
 
 use daic_correlate::*;
 use std::io::Write;
@@ -37,7 +37,12 @@ fn main() {
         Some("dense") => SolverChoice::Dense,
         _ => SolverChoice::Auto,
     };
-    let settings = Settings { subset: number(3, 33), shape, solver, ..Settings::default() };
+    let interpolation = match args.get(9).map(String::as_str) {
+        Some("cubic") => Interpolation::Cubic,
+        Some("septic") => Interpolation::Septic,
+        _ => Interpolation::Quintic,
+    };
+    let settings = Settings { subset: number(3, 33), shape, solver, interpolation, ..Settings::default() };
     let mut workspace = Workspace::new();
     let mut kept: Option<(Reference, Target)> = None;
     let roi = Roi {

@@ -168,7 +168,7 @@ impl<'a> Solver<'a> {
         if !self.cut(x, y, &mut scratch.cut) {
             return None;
         }
-        use Interpolation::{Cubic, Quintic};
+        use Interpolation::{Cubic, Quintic, Septic};
         use Shape::{Affine, Quadratic, Translation};
         let l = self.level;
         macro_rules! run {
@@ -177,6 +177,9 @@ impl<'a> Solver<'a> {
             };
         }
         match (self.target.interpolation, self.settings.shape) {
+            (Septic, Translation) => run!(8, 9, 0),
+            (Septic, Affine) => run!(8, 9, 1),
+            (Septic, Quadratic) => run!(8, 9, 2),
             (Quintic, Translation) => run!(6, 7, 0),
             (Quintic, Affine) => run!(6, 7, 1),
             (Quintic, Quadratic) => run!(6, 7, 2),
@@ -187,7 +190,7 @@ impl<'a> Solver<'a> {
     }
 
     fn optimise(&self, scratch: &mut Scratch, (x, y): (i32, i32), offset: [f64; 2], guess: &Warp) -> Outcome {
-        use Interpolation::{Cubic, Quintic};
+        use Interpolation::{Cubic, Quintic, Septic};
         use Shape::{Affine, Quadratic, Translation};
         let l = self.level;
         macro_rules! run {
@@ -196,6 +199,9 @@ impl<'a> Solver<'a> {
             };
         }
         match (self.target.interpolation, self.settings.shape) {
+            (Septic, Translation) => run!(8, 9, 0),
+            (Septic, Affine) => run!(8, 9, 1),
+            (Septic, Quadratic) => run!(8, 9, 2),
             (Quintic, Translation) => run!(6, 7, 0),
             (Quintic, Affine) => run!(6, 7, 1),
             (Quintic, Quadratic) => run!(6, 7, 2),

@@ -278,7 +278,11 @@ mod tests {
     }
 
     fn compare(radius: usize, gradient: f64, order: usize, taps: usize, cut: &[bool]) {
-        let kind = if taps == 6 { Interpolation::Quintic } else { Interpolation::Cubic };
+        let kind = match taps {
+            8 => Interpolation::Septic,
+            6 => Interpolation::Quintic,
+            _ => Interpolation::Cubic,
+        };
         let reference = Reference::new(texture());
         let (mut between, mut plane) = (Plane::default(), Plane::default());
         let level = Level::new();
@@ -307,6 +311,9 @@ mod tests {
             };
         }
         let sums = match (taps, order) {
+            (8, 0) => go!(8, 9, 0),
+            (8, 1) => go!(8, 9, 1),
+            (8, _) => go!(8, 9, 2),
             (6, 0) => go!(6, 7, 0),
             (6, 1) => go!(6, 7, 1),
             (6, 2) => go!(6, 7, 2),
@@ -346,7 +353,7 @@ mod tests {
         // 33 = 4·8 + 1, 25 = 3·8 + 1, 34 − 8 = 26 is even, 21 and 27 end in a partly filled group,
         // 23 = 2·8 + 7, 41 = 5·8 + 1
         for radius in [3, 5, 10, 11, 12, 13, 16, 20] {
-            for (order, taps) in [(0, 6), (1, 6), (2, 6), (1, 4), (2, 4)] {
+            for (order, taps) in [(0, 8), (1, 8), (2, 8), (0, 6), (1, 6), (2, 6), (1, 4), (2, 4)] {
                 // without carry, with carry, beyond the fast sampler
                 for gradient in [0.0, 0.004, 0.08, 0.3] {
                     compare(radius, gradient, order, taps, &[]);
@@ -363,7 +370,7 @@ mod tests {
             let used =
                 |i: usize, d: usize| 2 * i + d > width && i.abs_diff(radius) + d.abs_diff(width - 3) > 2;
             let cut: Vec<bool> = (0..width * width).map(|k| used(k % width, k / width)).collect();
-            for (order, taps) in [(0, 6), (1, 6), (2, 6), (1, 4)] {
+            for (order, taps) in [(1, 8), (0, 6), (1, 6), (2, 6), (1, 4)] {
                 compare(radius, 0.02, order, taps, &cut);
             }
         }
@@ -379,7 +386,9 @@ mod tests {
         };
         let grey = (0..w * h).map(|k| f((k % w) as f64, (k / w) as f64) as f32).collect();
         let image = Image::from_f32(w, h, grey).unwrap();
-        for (kind, taps) in [(Interpolation::Cubic, 4), (Interpolation::Quintic, 6)] {
+        for (kind, taps) in
+            [(Interpolation::Cubic, 4), (Interpolation::Quintic, 6), (Interpolation::Septic, 8)]
+        {
             let (mut between, mut plane) = (Plane::default(), Plane::default());
             plane::coefficients(Level::new(), &image, 0.0, kind, &mut between, &mut plane);
             for k in 0..50 {

@@ -7,17 +7,16 @@ use fearless_simd::{Level, f32x8, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
 
-/// Pixels added on every side. The slowest pole (0.43) has died out to 2e-12 over this distance,
-/// so the recursions may start from a constant, and warped subsets may overhang a little.
+/// Pixels added on every side. The slowest poles (0.43 quintic, 0.54 septic) have died out to 2e-12
+/// and 2e-9 over this distance, so the recursions may start from a constant, and warped subsets may
+/// overhang a little.
 pub(crate) const PAD: usize = 32;
 /// Rows that one horizontal recursion treats together: two groups of eight lanes hide its latency.
 const STRIP: usize = 16;
 /// Columns filtered together.
 const COLUMNS: usize = 32;
-/// Rows of which a filter down the columns is responsible at a time, and rows it runs in: the poles'
-/// memory has died out to 2e-9 by then, far below the rounding of single precision.
+/// Rows of which a filter down the columns is responsible at a time.
 const SLAB: usize = 128;
-const RUN_IN: usize = 24;
 const LANES: usize = 8;
 
 /// A padded plane of single-precision values; `stride` and `rows` are multiples of [`COLUMNS`].
@@ -59,11 +58,31 @@ impl Plane {
     }
 }
 
-/// Poles of the B-spline prefilter; the cubic spline has one, so its second is zero.
-fn poles(kind: Interpolation) -> [f32; 2] {
-    match kind {
-        Interpolation::Cubic => [-0.267_949_2, 0.0],
-        Interpolation::Quintic => [-0.430_575_35, -0.043_096_29],
+/// A B-spline of degree 2P + 1.
+#[derive(Clone, Copy)]
+struct Spline<const P: usize> {
+    /// Poles of the prefilter.
+    poles: [f32; P],
+    /// Derivative of the B-spline at −1, −2, …
+    slope: [f32; P],
+    /// Rows that a filter down the columns runs in: the slowest pole's memory has died out to 2e-9
+    /// by then, far below the rounding of single precision.
+    run_in: usize,
+}
+
+const CUBIC: Spline<1> = Spline { poles: [-0.267_949_2], slope: [1.0 / 2.0], run_in: 16 };
+const QUINTIC: Spline<2> =
+    Spline { poles: [-0.430_575_35, -0.043_096_29], slope: [10.0 / 24.0, 1.0 / 24.0], run_in: 24 };
+const SEPTIC: Spline<3> = Spline {
+    poles: [-0.535_280_4, -0.122_554_615, -0.009_148_695],
+    slope: [49.0 / 144.0, 7.0 / 90.0, 1.0 / 720.0],
+    run_in: 32,
+};
+
+impl<const P: usize> Spline<P> {
+    /// Gain of the prefilter at zero frequency, undone.
+    fn gain(&self) -> f32 {
+        self.poles.iter().map(|z| 1.0 - z).product::<f32>().powi(2)
     }
 }
 
@@ -77,19 +96,27 @@ pub(crate) fn coefficients(
     between: &mut Plane,
     out: &mut Plane,
 ) {
-    let z = poles(kind);
-    along_rows(level, image, minus, z, false, between);
-    along_columns(level, &Source::Plane(between), image, z, false, out);
+    macro_rules! filter {
+        ($spline:expr) => {{
+            along_rows(level, image, minus, &$spline, false, between);
+            along_columns(level, &Source::Plane(between), image, &$spline, false, out);
+        }};
+    }
+    match kind {
+        Interpolation::Cubic => filter!(CUBIC),
+        Interpolation::Quintic => filter!(QUINTIC),
+        Interpolation::Septic => filter!(SEPTIC),
+    }
 }
 
 /// d/dx of the interpolating quintic at the pixel centres.
 pub(crate) fn gradient_x(level: Level, image: &Image, minus: f32, out: &mut Plane) {
-    along_rows(level, image, minus, poles(Interpolation::Quintic), true, out);
+    along_rows(level, image, minus, &QUINTIC, true, out);
 }
 
 /// d/dy of the interpolating quintic at the pixel centres.
 pub(crate) fn gradient_y(level: Level, image: &Image, minus: f32, out: &mut Plane) {
-    along_columns(level, &Source::Image(minus), image, poles(Interpolation::Quintic), true, out);
+    along_columns(level, &Source::Image(minus), image, &QUINTIC, true, out);
 }
 
 /// One image row less a constant, mirrored at both ends.
@@ -106,7 +133,14 @@ fn load_row(src: &[f32], minus: f32, out: &mut [f32]) {
     }
 }
 
-fn along_rows(level: Level, image: &Image, minus: f32, z: [f32; 2], gradient: bool, out: &mut Plane) {
+fn along_rows<const P: usize>(
+    level: Level,
+    image: &Image,
+    minus: f32,
+    spline: &Spline<P>,
+    gradient: bool,
+    out: &mut Plane,
+) {
     out.resize(image);
     let stride = out.stride;
     let memory = || vec![0.0f32; 2 * stride * STRIP];
@@ -115,7 +149,7 @@ fn along_rows(level: Level, image: &Image, minus: f32, z: [f32; 2], gradient: bo
         for (i, row) in rows.chunks_exact_mut(stride).enumerate() {
             load_row(image.row(mirror(k * STRIP + i, image.height())), minus, row);
         }
-        dispatch!(level, s => filter_rows(s, stride, rows, z, gradient, memory));
+        dispatch!(level, s => filter_rows::<_, P>(s, stride, rows, spline, gradient, memory));
     });
 }
 
@@ -149,84 +183,126 @@ impl Source<'_> {
     }
 }
 
-/// Slabs of rows are filtered by themselves, each from [`RUN_IN`] rows before it to as many after: the
+/// Slabs of rows are filtered by themselves, each from `run_in` rows before it to as many after: the
 /// result does not depend on who filters which, and a slab's columns stay in the first-level cache.
-fn along_columns(
+fn along_columns<const P: usize>(
     level: Level,
     source: &Source<'_>,
     image: &Image,
-    z: [f32; 2],
+    spline: &Spline<P>,
     difference: bool,
     out: &mut Plane,
 ) {
     out.resize(image);
     let (stride, rows) = (out.stride, out.rows);
-    let memory = || vec![0.0f32; COLUMNS * (SLAB + 2 * RUN_IN)];
+    let memory = || vec![0.0f32; COLUMNS * (SLAB + 2 * spline.run_in)];
     let slabs = out.data.par_chunks_mut(stride * SLAB).enumerate();
     slabs.for_each_init(memory, |memory, (k, slab)| {
         for x in (0..stride).step_by(COLUMNS) {
-            let first = (k * SLAB) as i64 - RUN_IN as i64;
+            let first = (k * SLAB) as i64 - spline.run_in as i64;
             for (i, row) in memory.chunks_exact_mut(COLUMNS).enumerate() {
                 source.read(image, rows, x, first + i as i64, row);
             }
-            dispatch!(level, s => filter_columns(s, memory, z, difference));
+            dispatch!(level, s => filter_columns::<_, P>(s, memory, spline, difference));
             for (i, row) in slab.chunks_exact_mut(stride).enumerate() {
-                let at = (i + RUN_IN) * COLUMNS;
+                let at = (i + spline.run_in) * COLUMNS;
                 row[x..x + COLUMNS].copy_from_slice(&memory[at..at + COLUMNS]);
             }
         }
     });
 }
 
-/// Recursive prefilter down [`COLUMNS`] columns. Both poles share one sweep down and one up; the
+/// Recursive prefilter down [`COLUMNS`] columns. All poles share one sweep down and one up; the
 /// derivative, where asked for, follows the sweep up.
 #[simd]
-fn filter_columns<S: Simd>(s: S, data: &mut [f32], z: [f32; 2], difference: bool) {
+fn filter_columns<S: Simd, const P: usize>(
+    s: S,
+    data: &mut [f32],
+    spline: &Spline<P>,
+    difference: bool,
+) {
     const VECTORS: usize = COLUMNS / LANES;
     let v = |a: f32| f32x8::splat(s, a);
-    let (z1, z2) = (v(z[0]), v(z[1]));
-    let (i1, i2) = (v(1.0 / (1.0 - z[0])), v(1.0 / (1.0 - z[1])));
-    let gain = v(((1.0 - z[0]) * (1.0 - z[1])).powi(2));
-    let mut a = [v(0.0); VECTORS];
-    let mut b = [v(0.0); VECTORS];
+    let gain = v(spline.gain());
+    let recursion = Recursion::new(s, spline);
+    let mut a = [[v(0.0); P]; VECTORS];
     for k in 0..VECTORS {
-        a[k] = f32x8::from_slice(s, &data[LANES * k..][..LANES]) * i1;
-        b[k] = a[k] * i2;
+        a[k] = recursion.settled(f32x8::from_slice(s, &data[LANES * k..][..LANES]));
     }
+    let mut last = [v(0.0); VECTORS];
     for row in data.chunks_exact_mut(COLUMNS) {
         for (k, p) in row.chunks_exact_mut(LANES).enumerate() {
-            a[k] = z1.mul_add(a[k], f32x8::from_slice(s, p));
-            b[k] = z2.mul_add(b[k], a[k]);
-            b[k].store_slice(p);
+            last[k] = recursion.next(&mut a[k], f32x8::from_slice(s, p));
+            last[k].store_slice(p);
         }
     }
     for k in 0..VECTORS {
-        a[k] = b[k] * i1;
-        b[k] = a[k] * i2;
+        a[k] = recursion.settled(last[k]);
     }
     for row in data.chunks_exact_mut(COLUMNS).rev() {
         for (k, p) in row.chunks_exact_mut(LANES).enumerate() {
-            a[k] = z1.mul_add(a[k], f32x8::from_slice(s, p));
-            b[k] = z2.mul_add(b[k], a[k]);
-            (b[k] * gain).store_slice(p);
+            (recursion.next(&mut a[k], f32x8::from_slice(s, p)) * gain).store_slice(p);
         }
     }
     if !difference {
         return;
     }
-    let (k1, k2) = (v(10.0 / 24.0), v(1.0 / 24.0));
+    let slope = spline.slope.map(v);
     for x in (0..COLUMNS).step_by(LANES) {
-        let mut w = [v(0.0); 5];
-        for k in 0..4 {
+        let mut w = [v(0.0); MAX_SLOPE];
+        for k in 0..2 * P {
             w[k + 1] = f32x8::from_slice(s, &data[k * COLUMNS + x..][..LANES]);
         }
-        for y in 2..data.len() / COLUMNS - 2 {
-            for k in 0..4 {
+        for y in P..data.len() / COLUMNS - P {
+            for k in 0..2 * P {
                 w[k] = w[k + 1];
             }
-            w[4] = f32x8::from_slice(s, &data[(y + 2) * COLUMNS + x..][..LANES]);
-            ((w[4] - w[0]) * k2 + (w[3] - w[1]) * k1).store_slice(&mut data[y * COLUMNS + x..][..LANES]);
+            w[2 * P] = f32x8::from_slice(s, &data[(y + P) * COLUMNS + x..][..LANES]);
+            let mut g = (w[2 * P] - w[0]) * slope[P - 1];
+            for k in 1..P {
+                g += (w[2 * P - k] - w[k]) * slope[P - 1 - k];
+            }
+            g.store_slice(&mut data[y * COLUMNS + x..][..LANES]);
         }
+    }
+}
+
+/// Most taps of a derivative.
+const MAX_SLOPE: usize = 7;
+
+/// One sweep's first-order recursions, one behind the other.
+#[derive(Clone, Copy)]
+struct Recursion<S: Simd, const P: usize> {
+    poles: [f32x8<S>; P],
+    /// Gains at zero frequency.
+    gains: [f32x8<S>; P],
+}
+
+impl<S: Simd, const P: usize> Recursion<S, P> {
+    #[inline(always)]
+    fn new(s: S, spline: &Spline<P>) -> Self {
+        let v = |a: f32| f32x8::splat(s, a);
+        Self { poles: spline.poles.map(v), gains: spline.poles.map(|z| v(1.0 / (1.0 - z))) }
+    }
+
+    /// State after a constant has gone on for ever.
+    #[inline(always)]
+    fn settled(&self, mut x: f32x8<S>) -> [f32x8<S>; P] {
+        let mut state = self.gains;
+        for k in 0..P {
+            x = x * self.gains[k];
+            state[k] = x;
+        }
+        state
+    }
+
+    #[inline(always)]
+    fn next(&self, state: &mut [f32x8<S>; P], mut x: f32x8<S>) -> f32x8<S> {
+        for k in 0..P {
+            x = self.poles[k].mul_add(state[k], x);
+            state[k] = x;
+        }
+        x
     }
 }
 
@@ -246,18 +322,17 @@ pub(crate) fn transpose8<S: Simd>(mut a: [f32x8<S>; 8]) -> [f32x8<S>; 8] {
 /// Recursive prefilter along a strip of rows: transposed so that a lane is a row, filtered,
 /// differentiated where asked, and transposed back.
 #[simd]
-fn filter_rows<S: Simd>(
+fn filter_rows<S: Simd, const P: usize>(
     s: S,
     stride: usize,
     rows: &mut [f32],
-    z: [f32; 2],
+    spline: &Spline<P>,
     gradient: bool,
     memory: &mut [f32],
 ) {
     let v = |a: f32| f32x8::splat(s, a);
-    let (z1, z2) = (v(z[0]), v(z[1]));
-    let (i1, i2) = (v(1.0 / (1.0 - z[0])), v(1.0 / (1.0 - z[1])));
-    let gain = v(((1.0 - z[0]) * (1.0 - z[1])).powi(2));
+    let gain = v(spline.gain());
+    let recursion = Recursion::new(s, spline);
     let (strip, slope) = memory.split_at_mut(stride * STRIP);
     for h in 0..2 {
         let eight = &rows[8 * h * stride..8 * (h + 1) * stride];
@@ -272,37 +347,36 @@ fn filter_rows<S: Simd>(
             }
         }
     }
-    let mut a = [v(0.0); 2];
-    let mut b = [v(0.0); 2];
+    let mut a = [[v(0.0); P]; 2];
     for h in 0..2 {
-        a[h] = f32x8::from_slice(s, &strip[8 * h..][..LANES]) * i1;
-        b[h] = a[h] * i2;
+        a[h] = recursion.settled(f32x8::from_slice(s, &strip[8 * h..][..LANES]));
     }
+    let mut last = [v(0.0); 2];
     for c in strip.chunks_exact_mut(STRIP) {
         for (h, p) in c.chunks_exact_mut(LANES).enumerate() {
-            a[h] = z1.mul_add(a[h], f32x8::from_slice(s, p));
-            b[h] = z2.mul_add(b[h], a[h]);
-            b[h].store_slice(p);
+            last[h] = recursion.next(&mut a[h], f32x8::from_slice(s, p));
+            last[h].store_slice(p);
         }
     }
     for h in 0..2 {
-        a[h] = b[h] * i1;
-        b[h] = a[h] * i2;
+        a[h] = recursion.settled(last[h]);
     }
     for c in strip.chunks_exact_mut(STRIP).rev() {
         for (h, p) in c.chunks_exact_mut(LANES).enumerate() {
-            a[h] = z1.mul_add(a[h], f32x8::from_slice(s, p));
-            b[h] = z2.mul_add(b[h], a[h]);
-            (b[h] * gain).store_slice(p);
+            (recursion.next(&mut a[h], f32x8::from_slice(s, p)) * gain).store_slice(p);
         }
     }
     if gradient {
-        let (k1, k2) = (v(10.0 / 24.0), v(1.0 / 24.0));
-        for (w, o) in strip.windows(5 * STRIP).step_by(STRIP).zip(slope[2 * STRIP..].chunks_exact_mut(STRIP))
-        {
+        let weights = spline.slope.map(v);
+        let windows = strip.windows((2 * P + 1) * STRIP).step_by(STRIP);
+        for (w, o) in windows.zip(slope[P * STRIP..].chunks_exact_mut(STRIP)) {
             for h in 0..2 {
                 let at = |k: usize| f32x8::from_slice(s, &w[k * STRIP + 8 * h..][..LANES]);
-                ((at(4) - at(0)) * k2 + (at(3) - at(1)) * k1).store_slice(&mut o[8 * h..8 * h + LANES]);
+                let mut g = (at(2 * P) - at(0)) * weights[P - 1];
+                for k in 1..P {
+                    g += (at(2 * P - k) - at(k)) * weights[P - 1 - k];
+                }
+                g.store_slice(&mut o[8 * h..8 * h + LANES]);
             }
         }
     }

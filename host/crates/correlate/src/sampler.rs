@@ -6,15 +6,15 @@ use fearless_simd::{f32x8, mask32x8, prelude::*};
 pub(crate) type V<S> = f32x8<S>;
 const LANES: usize = 8;
 
-/// B-spline weights of the N taps (6 quintic, 4 cubic) along both axes, for fractions t of the
+/// B-spline weights of the N taps (8 septic, 6 quintic, 4 cubic) along both axes, for fractions t of the
 /// pixel given as t − ½. In this variable tap k and tap N−1−k share their even part and differ in
 /// the sign of the odd one. Both axes go side by side so that they share the constants.
 #[inline(always)]
-pub(crate) fn weights<S: Simd, const N: usize>(s: S, x: V<S>, y: V<S>) -> ([V<S>; 7], [V<S>; 7]) {
+pub(crate) fn weights<S: Simd, const N: usize>(s: S, x: V<S>, y: V<S>) -> ([V<S>; 9], [V<S>; 9]) {
     let k = |a: f32| V::splat(s, a);
     let (q, p) = (x * x, y * y);
-    let mut w = [k(0.0); 7];
-    let mut z = [k(0.0); 7];
+    let mut w = [k(0.0); 9];
+    let mut z = [k(0.0); 9];
     macro_rules! pair {
         ($a:expr, $b:expr; $e0:expr, $($e:expr),+; $o0:expr, $($o:expr),+) => {{
             let mut e = (k($e0), k($e0));
@@ -28,7 +28,16 @@ pub(crate) fn weights<S: Simd, const N: usize>(s: S, x: V<S>, y: V<S>) -> ([V<S>
             z[$b] = e.1 + o.1;
         }};
     }
-    if N == 6 {
+    if N == 8 {
+        pair!(0, 7; 1. / 1440., 1. / 1152., 1. / 7680., 1. / 645_120.;
+            1. / 5040., 1. / 960., 1. / 2304., 1. / 46_080.);
+        pair!(1, 6; -1. / 288., 19. / 1152., 47. / 1536., 2179. / 645_120.;
+            -1. / 720., 1. / 960., 73. / 2304., 721. / 46_080.);
+        pair!(2, 5; 1. / 160., -7. / 128., 403. / 2560., 20_219. / 215_040.;
+            1. / 240., -19. / 960., 5. / 2304., 9821. / 46_080.);
+        pair!(3, 4; -1. / 288., 43. / 1152., -289. / 1536., 259_723. / 645_120.;
+            -1. / 144., 3. / 64., -43. / 256., 289. / 1024.);
+    } else if N == 6 {
         pair!(0, 5; 1. / 48., 1. / 96., 1. / 3840.; 1. / 120., 1. / 48., 1. / 384.);
         pair!(1, 4; -1. / 16., 7. / 32., 79. / 1280.; -1. / 24., 1. / 16., 25. / 128.);
         pair!(2, 3; 1. / 24., -11. / 48., 841. / 1920.; 1. / 12., -7. / 24., 77. / 192.);
@@ -41,9 +50,9 @@ pub(crate) fn weights<S: Simd, const N: usize>(s: S, x: V<S>, y: V<S>) -> ([V<S>
 
 /// Lanes whose integer part is one larger use the same taps, shifted by one.
 #[inline(always)]
-pub(crate) fn shifted<S: Simd, const N: usize>(s: S, w: [V<S>; 7], m: mask32x8<S>) -> [V<S>; 7] {
+pub(crate) fn shifted<S: Simd, const N: usize>(s: S, w: [V<S>; 9], m: mask32x8<S>) -> [V<S>; 9] {
     let zero = V::splat(s, 0.0);
-    let mut o = [zero; 7];
+    let mut o = [zero; 9];
     o[0] = m.select(zero, w[0]);
     for i in 1..N {
         o[i] = m.select(w[i - 1], w[i]);
@@ -59,8 +68,8 @@ pub(crate) fn convolve<S: Simd, const NX: usize, const NY: usize>(
     s: S,
     plane: &Plane,
     origin: usize,
-    wx: &[V<S>; 7],
-    wy: &[V<S>; 7],
+    wx: &[V<S>; 9],
+    wy: &[V<S>; 9],
 ) -> Option<V<S>> {
     let stride = plane.stride;
     let mut rest = plane.data.get(origin..)?;
@@ -105,7 +114,7 @@ const ONE: f64 = 4_294_967_296.0;
 /// `u` and `v` (pixels; constant, linear and quadratic coefficient in the distance from the first
 /// pixel), into `out`. Loads are contiguous: all eight lanes use one window of taps, lanes whose
 /// integer part is one larger have their weights shifted by one tap. At the seams between spline
-/// pieces a lane may be treated as either side's: the pieces join with four continuous derivatives.
+/// pieces a lane may be treated as either side's: the pieces join smoothly.
 #[inline(always)]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn sample_row<S: Simd, const N: usize, const N1: usize, const O: usize>(
@@ -229,4 +238,39 @@ pub(crate) fn sample_lanes<S: Simd, const N: usize>(
         g = wx[i].mul_add(m[i], g);
     }
     g
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::noise::spline;
+    use crate::scalar::basis;
+    use crate::simd::dispatch;
+    use fearless_simd::Level;
+
+    fn check<S: Simd, const N: usize>(s: S) {
+        let half = N as f64 / 2.0 - 1.0;
+        for k in 0..64u8 {
+            let (x, y) = (f32::from(k) / 64.0, 1.0 - f32::from(k) / 64.0);
+            let (w, z) = weights::<S, N>(s, V::splat(s, x - 0.5), V::splat(s, y - 0.5));
+            for (t, w) in [(x, w), (y, z)] {
+                for (tap, w) in w.iter().enumerate() {
+                    let distance = f64::from(t) + half - tap as f64;
+                    let expected = spline(N as u32 - 1, distance);
+                    // rounding of single precision
+                    assert!((f64::from(w[0]) - expected).abs() < 1e-7, "{N} taps, tap {tap} at {t}");
+                    assert!((basis(N, distance) - expected).abs() < 1e-14, "{N} taps, tap {tap} at {t}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn weights_are_those_of_the_recursion() {
+        dispatch!(Level::new(), s => {
+            check::<_, 4>(s);
+            check::<_, 6>(s);
+            check::<_, 8>(s);
+        });
+    }
 }

@@ -73,13 +73,17 @@ pub(crate) fn load(
     subset.centre = Some((x, y));
 }
 
-fn basis(taps: usize, x: f64) -> f64 {
+/// Centred B-spline of degree `taps` − 1 in truncated powers.
+pub(crate) fn basis(taps: usize, x: f64) -> f64 {
     let x = x.abs();
     if taps == 4 {
         if x < 1.0 { 2.0 / 3.0 - x * x * (1.0 - 0.5 * x) } else { (2.0 - x).max(0.0).powi(3) / 6.0 }
-    } else {
+    } else if taps == 6 {
         let p = |a: f64| (a - x).max(0.0).powi(5);
         (p(3.0) - 6.0 * p(2.0) + 15.0 * p(1.0)) / 120.0
+    } else {
+        let p = |a: f64| (a - x).max(0.0).powi(7);
+        (p(4.0) - 8.0 * p(3.0) + 28.0 * p(2.0) - 56.0 * p(1.0)) / 5040.0
     }
 }
 

@@ -18,7 +18,7 @@ use crate::icgn::{Outcome, Solver};
 use crate::point::{SolvedBy, Status};
 use crate::points::{Grid, Points};
 use crate::prepared::Reference;
-use crate::settings::{Interpolation, Settings};
+use crate::settings::Settings;
 use crate::shape::Warp;
 use nodes::Nodes;
 use pass::{Buffers, DISTANCE, GAIN, Pass, ZNCC, outputs};
@@ -211,7 +211,7 @@ impl Dense {
                 nodes: &self.nodes,
                 plane: &solver.target.coefficients,
                 criterion: solver.settings.criterion,
-                taps: if solver.target.interpolation == Interpolation::Quintic { 6 } else { 4 },
+                interpolation: solver.target.interpolation,
                 order,
             };
             let buffers = &self.buffers;

@@ -13,7 +13,7 @@ use super::tiling::{DEGREES, LANES, Task, Tiling, moments};
 use super::warp::{RowField, Spread, warp_row};
 use crate::plane::Plane;
 use crate::sampler::V;
-use crate::settings::Criterion;
+use crate::settings::{Criterion, Interpolation};
 use crate::simd::dispatch;
 use fearless_simd::{Level, prelude::*};
 use fearless_simd_macros::simd;
@@ -57,8 +57,7 @@ pub(crate) struct Pass<'a> {
     pub(crate) plane: &'a Plane,
     /// Reference grey levels hold f − `f_offset`, coefficients g − `g_offset`.
     pub(crate) criterion: Criterion,
-    /// Taps of the spline: 6 or 4.
-    pub(crate) taps: usize,
+    pub(crate) interpolation: Interpolation,
     pub(crate) order: usize,
 }
 
@@ -77,13 +76,17 @@ impl Pass<'_> {
                 dispatch!(level, s => run::<_, $n, $n1, $o>(s, self, task, data, buffers, out))
             };
         }
-        match (self.taps, self.order) {
-            (6, 0) => go!(6, 7, 0),
-            (6, 1) => go!(6, 7, 1),
-            (6, _) => go!(6, 7, 2),
-            (_, 0) => go!(4, 5, 0),
-            (_, 1) => go!(4, 5, 1),
-            (_, _) => go!(4, 5, 2),
+        use Interpolation::{Cubic, Quintic, Septic};
+        match (self.interpolation, self.order) {
+            (Septic, 0) => go!(8, 9, 0),
+            (Septic, 1) => go!(8, 9, 1),
+            (Septic, _) => go!(8, 9, 2),
+            (Quintic, 0) => go!(6, 7, 0),
+            (Quintic, 1) => go!(6, 7, 1),
+            (Quintic, _) => go!(6, 7, 2),
+            (Cubic, 0) => go!(4, 5, 0),
+            (Cubic, 1) => go!(4, 5, 1),
+            (Cubic, _) => go!(4, 5, 2),
         }
     }
 }

@@ -109,7 +109,7 @@ fn settings(b: &mut Bytes<'_>) -> Settings {
     let mut s = Settings {
         subset: [5, 7, 9, 11, 13, 17, 21, 25, 33, 41][b.below(10)],
         shape: [Shape::Translation, Shape::Affine, Shape::Quadratic][b.below(3)],
-        interpolation: [Interpolation::Quintic, Interpolation::Cubic][b.below(2)],
+        interpolation: [Interpolation::Quintic, Interpolation::Cubic, Interpolation::Septic][b.below(3)],
         criterion: [Criterion::Znssd, Criterion::Zssd][b.below(2)],
         solver: [SolverChoice::Auto, SolverChoice::Dense, SolverChoice::Exact][b.below(3)],
         ..Settings::default()

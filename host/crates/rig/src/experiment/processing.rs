@@ -76,6 +76,8 @@ pub enum Interpolation {
     Cubic,
     /// Degree 5.
     Quintic,
+    /// Degree 7.
+    Septic,
 }
 
 /// How a pair of views becomes a point in space.
