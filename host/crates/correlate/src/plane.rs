@@ -215,12 +215,7 @@ fn along_columns<const P: usize>(
 /// Recursive prefilter down [`COLUMNS`] columns. All poles share one sweep down and one up; the
 /// derivative, where asked for, follows the sweep up.
 #[simd]
-fn filter_columns<S: Simd, const P: usize>(
-    s: S,
-    data: &mut [f32],
-    spline: &Spline<P>,
-    difference: bool,
-) {
+fn filter_columns<S: Simd, const P: usize>(s: S, data: &mut [f32], spline: &Spline<P>, difference: bool) {
     const VECTORS: usize = COLUMNS / LANES;
     let v = |a: f32| f32x8::splat(s, a);
     let gain = v(spline.gain());

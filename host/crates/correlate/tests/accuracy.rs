@@ -62,9 +62,7 @@ fn measure(field: &str, size: usize, c: &Correlation) -> score::Score {
 
 #[test]
 fn translations_and_stretches_are_unbiased_and_at_the_bound() {
-    let Some(dir) =
-        shared("translations_and_stretches_are_unbiased_and_at_the_bound", "golden/dic")
-    else {
+    let Some(dir) = shared("translations_and_stretches_are_unbiased_and_at_the_bound", "golden/dic") else {
         return;
     };
     for (noise, bound) in BOUND {
@@ -94,7 +92,8 @@ fn quadratic_field_at_the_bound_of_the_quadratic_shape() {
     for (noise, grey) in [("n0", (1.0f64 / 12.0).sqrt()), ("n2", (4.0f64 + 1.0 / 12.0).sqrt())] {
         let pair = Pair::golden(&dir, noise, "quad");
         for solver in BOTH {
-            let settings = Settings { shape: Shape::Quadratic, solver, noise: Some(grey), ..Settings::default() };
+            let settings =
+                Settings { shape: Shape::Quadratic, solver, noise: Some(grey), ..Settings::default() };
             let c = pair.correlate(&settings);
             let s = measure("quad", 1024, &c);
             // with the noise given, σ is the bound of each subset
@@ -103,7 +102,10 @@ fn quadratic_field_at_the_bound_of_the_quadratic_shape() {
                 let ok: Vec<f64> = c.points.iter().filter(|p| p.status.is_ok()).map(squares).collect();
                 (ok.iter().sum::<f64>() / ok.len() as f64).sqrt()
             });
-            println!("{noise} quad {solver:?}: bias {:.2e?}, scatter {:.3e?} of {bound:.3e?}", s.bias, s.scatter);
+            println!(
+                "{noise} quad {solver:?}: bias {:.2e?}, scatter {:.3e?} of {bound:.3e?}",
+                s.bias, s.scatter
+            );
             for k in 0..2 {
                 assert!(s.scatter[k] <= EXCESS * bound[k]);
                 // twice the uncertainty of the mean over some 800 subsets, and what n0 may be off
@@ -179,7 +181,8 @@ fn noise_makes_no_bias() {
             let [m, n] = [0, 1].map(|_| noisy(&zero, 2.0, &mut rng));
             // noise and its negative: what is linear in it cancels, a bias stays
             for sign in [1.0, -1.0] {
-                let add = |g: &[f64], n: &[f64]| g.iter().zip(n).map(|(g, n)| g + sign * n).collect::<Vec<_>>();
+                let add =
+                    |g: &[f64], n: &[f64]| g.iter().zip(n).map(|(g, n)| g + sign * n).collect::<Vec<_>>();
                 sum += mean(&add(&a, &m), &add(&b, &n)) / 40.0;
             }
         }
@@ -196,10 +199,8 @@ fn the_star_is_resolved() {
     let pair = Pair::golden(&dir, "n0", "star");
     for (shape, limit) in [(Shape::Affine, 137.0), (Shape::Quadratic, 44.5)] {
         for solver in [SolverChoice::Exact, SolverChoice::Auto] {
-            let roi = Roi {
-                rectangle: Some(Rectangle { x: 40, y: 40, width: 944, height: 944 }),
-                mask: None,
-            };
+            let roi =
+                Roi { rectangle: Some(Rectangle { x: 40, y: 40, width: 944, height: 944 }), mask: None };
             let settings = Settings { shape, solver, ..Settings::default() };
             let points = Points::grid(1024, 1024, settings.subset, 5, &roi).unwrap();
             let c = correlate(&pair.reference, &pair.target, &points, &Guess::Fft, &settings, &()).unwrap();
