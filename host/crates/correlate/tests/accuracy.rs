@@ -71,7 +71,7 @@ fn translations_and_stretches_are_unbiased_and_at_the_bound() {
             for solver in BOTH {
                 let c = pair.correlate(&Settings { solver, ..Settings::default() });
                 let s = measure(case, 1024, &c);
-                println!("{noise} {case} {solver:?}: bias {:.2e?}, scatter {:.3e?}", s.bias, s.scatter);
+                println!("{noise} {case} {solver:?}: bias {:?}, scatter {:?}", s.bias, s.scatter);
                 for k in 0..2 {
                     assert!(s.scatter[k] <= EXCESS * bound, "{:?}", s.scatter);
                     // some 800 subsets beside one another leave the mean at n2 uncertain by
@@ -103,7 +103,7 @@ fn quadratic_field_at_the_bound_of_the_quadratic_shape() {
                 (ok.iter().sum::<f64>() / ok.len() as f64).sqrt()
             });
             println!(
-                "{noise} quad {solver:?}: bias {:.2e?}, scatter {:.3e?} of {bound:.3e?}",
+                "{noise} quad {solver:?}: bias {:?}, scatter {:?} of {bound:?}",
                 s.bias, s.scatter
             );
             for k in 0..2 {
