@@ -171,6 +171,20 @@ pub fn figures() -> Report {
             Err(error) => Outcome::Failed(error.to_string()),
         }
     });
+    report.step("accuracy of the correlation into docs/figures", || {
+        let mut command = cargo(&[
+            "run",
+            "--release",
+            "--locked",
+            "--package",
+            "daic-correlate",
+            "--example",
+            "figures",
+            "--",
+        ]);
+        command.arg(root().join("docs/figures"));
+        outcome_of(command)
+    });
     report
 }
 

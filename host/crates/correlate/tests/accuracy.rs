@@ -46,7 +46,8 @@ impl Pair {
         };
         let points = Points::grid(size, size, settings.subset, 5, &roi).unwrap();
         let c = correlate(&self.reference, &self.target, &points, &Guess::Fft, settings, &()).unwrap();
-        assert!(c.converged() * 1000 >= points.len() * 999, "{} of {}", c.converged(), points.len());
+        // the dense form alone gives up a few noisy points that the exact form takes over
+        assert!(c.converged() * 1000 >= points.len() * 990, "{} of {}", c.converged(), points.len());
         c
     }
 }
@@ -71,7 +72,7 @@ fn translations_and_stretches_are_unbiased_and_at_the_bound() {
             for solver in BOTH {
                 let c = pair.correlate(&Settings { solver, ..Settings::default() });
                 let s = measure(case, 1024, &c);
-                println!("{noise} {case} {solver:?}: bias {:?}, scatter {:?}", s.bias, s.scatter);
+                println!("{noise} {case} {solver:?}: {}", s.line());
                 for k in 0..2 {
                     assert!(s.scatter[k] <= EXCESS * bound, "{:?}", s.scatter);
                     // some 800 subsets beside one another leave the mean at n2 uncertain by
@@ -102,10 +103,7 @@ fn quadratic_field_at_the_bound_of_the_quadratic_shape() {
                 let ok: Vec<f64> = c.points.iter().filter(|p| p.status.is_ok()).map(squares).collect();
                 (ok.iter().sum::<f64>() / ok.len() as f64).sqrt()
             });
-            println!(
-                "{noise} quad {solver:?}: bias {:?}, scatter {:?} of {bound:?}",
-                s.bias, s.scatter
-            );
+            println!("{noise} quad {solver:?}: {}, bound {:.3e} {:.3e}", s.line(), bound[0], bound[1]);
             for k in 0..2 {
                 assert!(s.scatter[k] <= EXCESS * bound[k]);
                 // twice the uncertainty of the mean over some 800 subsets, and what n0 may be off
@@ -156,7 +154,8 @@ fn no_shift_is_biased() {
             let (bias, scatter) = mean_std(&eu);
             let across = mean_std(&ev).0;
             println!("{u} {solver:?}: {bias:.2e} ± {scatter:.1e}, across {across:.1e}");
-            assert!(bias.abs() <= 1.5e-4 && across.abs() <= 1.5e-4);
+            // measured: 1.2e-5 along and 1.4e-7 across
+            assert!(bias.abs() <= 1.5e-5 && across.abs() <= 1e-6);
         }
     }
 }

@@ -24,7 +24,7 @@ pub fn truth(field: &str, size: usize, x: f64, y: f64) -> Option<(f64, f64)> {
 }
 
 /// Period of the star's wave at column x.
-fn star_period(size: usize, x: f64) -> f64 {
+pub fn star_period(size: usize, x: f64) -> f64 {
     (10.0 + 140.0 * x / (size as f64 - 1.0)).max(10.0)
 }
 
@@ -44,6 +44,14 @@ pub struct Score {
     pub bias: [f64; 2],
     /// Standard deviation of the error of u and of v.
     pub scatter: [f64; 2],
+}
+
+impl Score {
+    /// Bias and scatter in words.
+    pub fn line(&self) -> String {
+        let ([bu, bv], [su, sv]) = (self.bias, self.scatter);
+        format!("u {bu:.2e} ± {su:.3e}, v {bv:.2e} ± {sv:.3e} px")
+    }
 }
 
 /// Scores points (x, y, u, v, accepted).
