@@ -14,7 +14,7 @@ const EXCESS: f64 = 1.05;
 /// Cramér–Rao bound of the golden images, 33 × 33, affine, gain and offset free: quantised only,
 /// and with noise of 2 grey levels.
 const BOUND: [(&str, f64); 2] = [("n0", 6.5e-4), ("n2", 4.55e-3)];
-const BOTH: [SolverChoice; 2] = [SolverChoice::Exact, SolverChoice::Dense];
+const BOTH: [SolverChoice; 2] = [SolverChoice::Exact, SolverChoice::Auto];
 
 struct Pair {
     reference: Reference,
@@ -46,8 +46,7 @@ impl Pair {
         };
         let points = Points::grid(size, size, settings.subset, 5, &roi).unwrap();
         let c = correlate(&self.reference, &self.target, &points, &Guess::Fft, settings, &()).unwrap();
-        // the dense form alone gives up a few noisy points that the exact form takes over
-        assert!(c.converged() * 1000 >= points.len() * 990, "{} of {}", c.converged(), points.len());
+        assert!(c.converged() * 1000 >= points.len() * 999, "{} of {}", c.converged(), points.len());
         c
     }
 }

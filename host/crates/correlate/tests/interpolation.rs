@@ -16,7 +16,7 @@ fn biases(what: &str, (a, b): (&Image, &Image), step: usize, truth: f64) -> Vec<
     let mut out = Vec::new();
     for interpolation in [Interpolation::Quintic, Interpolation::Septic] {
         let target = Target::new(b.clone(), interpolation);
-        for solver in [SolverChoice::Exact, SolverChoice::Dense] {
+        for solver in [SolverChoice::Exact, SolverChoice::Auto] {
             let settings = Settings { interpolation, solver, ..Settings::default() };
             let points = Points::grid(width, height, settings.subset, step, &roi).unwrap();
             let c = correlate(&reference, &target, &points, &Guess::Fft, &settings, &()).unwrap();

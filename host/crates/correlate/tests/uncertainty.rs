@@ -28,7 +28,7 @@ fn check(shape: Shape, contrasts: [f64; 2], noise: f64) {
     let rectangle = Some(Rectangle { x: 20, y: 20, width: 120, height: 120 });
     let points = Points::grid(N, N, 33, 8, &Roi { rectangle, mask: None }).unwrap();
     let guess = vec![Some(TRUTH); points.len()];
-    let ways = [SolverChoice::Exact, SolverChoice::Dense].map(|solver| {
+    let ways = [SolverChoice::Exact, SolverChoice::Auto].map(|solver| {
         [None, Some(noise)].map(|noise| Settings { shape, solver, noise, ..Settings::default() })
     });
     let ways = ways.as_flattened();
