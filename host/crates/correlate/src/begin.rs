@@ -271,7 +271,7 @@ impl Propagation<'_> {
     /// Points near matched features, from the affine map around them.
     fn by_features(&mut self) -> Vec<usize> {
         let open: Vec<usize> =
-            (0..self.points.len()).filter(|&k| self.outcomes[k].is_none() && self.fits(k)).collect();
+            (0..self.points.len()).filter(|&k| !self.accepted(k) && self.fits(k)).collect();
         if self.features.is_none() {
             let (a, b) = (&self.solver.reference.image, &self.solver.target.image);
             let cover = Cover::new(self, &open, a.width(), a.height());
