@@ -290,7 +290,7 @@ impl<'a> Solver<'a> {
         (x, y): (i32, i32),
         warp: &Warp,
         numbers: &Numbers,
-    ) -> Result<(f64, [f32; 2]), Status> {
+    ) -> Result<Accepted, Status> {
         let independent = self.independent(numbers);
         if !self.inside(x, y, numbers.extent, warp, BORDER) {
             Err(Status::OutOfImage)
@@ -299,7 +299,8 @@ impl<'a> Solver<'a> {
         } else if !warp.stretches_less(self.settings.max_log_stretch) {
             Err(Status::Distorted)
         } else {
-            Ok((independent, self.sigma(warp, numbers)))
+            let (sigma, excess) = self.sigma(warp, numbers);
+            Ok(Accepted { independent, sigma, excess })
         }
     }
 
@@ -314,7 +315,7 @@ impl<'a> Solver<'a> {
 
     /// Standard uncertainties of u and v; the offset of the grey levels is free, and so is their gain
     /// unless the criterion fixes it.
-    fn sigma(&self, warp: &Warp, numbers: &Numbers) -> [f32; 2] {
+    fn sigma(&self, warp: &Warp, numbers: &Numbers) -> ([f32; 2], f64) {
         let n = numbers.count;
         let r = self.layout.radius as f64;
         let m = self.settings.shape.parameters_per_component();
@@ -333,6 +334,7 @@ impl<'a> Solver<'a> {
             }
         };
         let mut out = [f32::NAN; 2];
+        let mut largest = 0.0f64;
         for (c, o) in out.iter_mut().enumerate() {
             // Noise in the gradients makes the normal matrix H look better than it is: the true one is
             // H₀ = H (1 − excess). The right-hand side is Σ G (n_f − gain n_g). The reference's own
@@ -340,11 +342,12 @@ impl<'a> Solver<'a> {
             // image's noise meets true gradients, which lie where the spline passes all, and those of
             // noise, of which it passes what it passes of white noise (to 0.3 % of it; cubic: 6 %).
             let excess = (n * self.noise.gradient * noise / energy[c]).min(0.8);
+            largest = largest.max(excess);
             let honest = 1.0 - excess;
             let right = honest + gain2 * (honest + excess * passed);
             *o = (noise * variance[c] * right).max(0.0).sqrt() as f32 / honest as f32;
         }
-        out
+        (out, largest)
     }
 
     /// Variances of u and v at an offset from the centre per unit of residual variance, from the
@@ -370,6 +373,16 @@ impl<'a> Solver<'a> {
             }
         })
     }
+}
+
+/// What is known of a subset that is accepted by itself.
+pub(crate) struct Accepted {
+    /// Independent speckles.
+    pub(crate) independent: f64,
+    /// Standard uncertainties of u and v.
+    pub(crate) sigma: [f32; 2],
+    /// Share of noise in the energy of the gradients, the larger one of x and y.
+    pub(crate) excess: f64,
 }
 
 /// What a verdict on a subset rests on.
@@ -524,7 +537,7 @@ fn iterate<S: Simd, const N: usize, const N1: usize, const O: usize>(
             left: fit.energy,
         };
         match solver.verdict((x, y), &warp, &numbers) {
-            Ok((independent, sigma)) => (out.independent, out.sigma) = (independent, sigma),
+            Ok(a) => (out.independent, out.sigma) = (a.independent, a.sigma),
             Err(status) => out.status = status,
         }
     }

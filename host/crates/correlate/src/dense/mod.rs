@@ -14,7 +14,7 @@ mod warp;
 
 use crate::correlate::Observer;
 use crate::domain::Coverage;
-use crate::icgn::{Outcome, Solver};
+use crate::icgn::{Accepted, Outcome, Solver};
 use crate::point::{SolvedBy, Status};
 use crate::points::{Grid, Points};
 use crate::prepared::Reference;
@@ -38,6 +38,9 @@ const LINEAR: f32 = 0.1;
 const CURVATURE: f64 = 0.33;
 /// That error may be this part of the point's own uncertainty, or this many pixels.
 const NEGLIGIBLE: f64 = 0.2;
+/// Share of noise in the energy of the gradients above which a point is left to the exact form: the
+/// dense form's fixed point is drawn towards the field by about this share, and its scatter with it.
+const NOISY: f64 = 0.2;
 const NEGLIGIBLE_PX: f64 = 1e-4;
 /// Distance up to which a point's result is good enough to carry the field for the next pass.
 const CARRIES: f32 = 2.0;
@@ -452,8 +455,8 @@ impl Dense {
             left: 2.0 * sff * (1.0 - zncc),
         };
         match solver.verdict(centre, &warp, &numbers) {
-            Ok((_, sigma)) if !negligible(distance, sigma) => (None, Some(warp)),
-            Ok((independent, sigma)) => {
+            Ok(a) if a.excess > NOISY || !negligible(distance, a.sigma) => (None, Some(warp)),
+            Ok(Accepted { independent, sigma, .. }) => {
                 let o = Outcome {
                     warp,
                     zncc,
