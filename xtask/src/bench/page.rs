@@ -232,8 +232,8 @@ fn live(p: &mut String, found: &Findings) {
         return;
     }
     p.push_str(
-        "## Live\n\nFrom the 8-bit pixels of a 2592 × 1944 frame in memory to a height map with σ: both views matched, 59 × 59, step 5, \\
-         every frame starts from the last, two frames in turn (50, −30 and 200 µm apart). Wall time, median of 21. Target: 10 frames/s with two threads.\n\n\\
+        "## Live\n\nFrom the 8-bit pixels of a 2592 × 1944 frame in memory to a height map with σ: both views matched, 59 × 59, step 5, \
+         every frame starts from the last, two frames in turn (50, −30 and 200 µm apart). Wall time, median of 21. Target: 10 frames/s with two threads.\n\n\
          | subset | threads | frames/s | last frame |\n|---|---|---|---|\n",
     );
     for l in &found.live {

@@ -281,7 +281,7 @@ impl Propagation<'_> {
             self.features = Some(found);
         }
         let seeds = self.feature_seeds(&open);
-        let found = self.from_features(&seeds);
+        let found = self.near_features(&seeds);
         self.note(StartMethod::Features, seeds.len(), found)
     }
 
@@ -314,7 +314,7 @@ impl Propagation<'_> {
 
     /// Starts points from the affine map of the features around them; returns those accepted. Where
     /// next to none of many succeeds the rest is not tried.
-    pub(crate) fn from_features(&mut self, seeds: &[usize]) -> Vec<usize> {
+    pub(crate) fn near_features(&mut self, seeds: &[usize]) -> Vec<usize> {
         let mut accepted = Vec::new();
         let mut tried = 0;
         for batch in seeds.chunks(BATCH) {

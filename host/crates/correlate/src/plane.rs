@@ -285,7 +285,7 @@ impl<S: Simd, const P: usize> Recursion<S, P> {
     fn settled(&self, mut x: f32x8<S>) -> [f32x8<S>; P] {
         let mut state = self.gains;
         for k in 0..P {
-            x = x * self.gains[k];
+            x *= self.gains[k];
             state[k] = x;
         }
         state

@@ -501,7 +501,7 @@ impl<'a> Propagation<'a> {
         if seeds.is_empty() {
             return Vec::new();
         }
-        let mut found = self.from_features(&seeds);
+        let mut found = self.near_features(&seeds);
         seeds.retain(|&k| !self.accepted(k));
         let windows = match guess {
             Guess::Search { u, v } => vec![Window::range(*u, *v)],

@@ -1,5 +1,7 @@
 //! Subsets cut by a mask or by the image's edge use what is inside, and nothing else.
 
+#![allow(clippy::needless_range_loop)] // pixel by pixel
+
 mod common;
 use common::*;
 use daic_correlate::*;

@@ -339,7 +339,8 @@ fn cross_correlation_reaches_half_the_image() {
     let plain = |x: f64, y: f64| sheet.speckles.at(x + N as f64, y + N as f64);
     // a grating of 14 px with about as much contrast as the speckles
     let periodic = |x: f64, y: f64| plain(x, y) + 20.0 * ((x * 0.449).sin() + (y * 0.449).cos());
-    let textures: [(&str, &dyn Fn(f64, f64) -> f64); 2] = [("speckles", &plain), ("periodic", &periodic)];
+    type Texture<'a> = &'a dyn Fn(f64, f64) -> f64;
+    let textures: [(&str, Texture<'_>); 2] = [("speckles", &plain), ("periodic", &periodic)];
     for (name, texture) in textures {
         let shot = |t: [f64; 2]| -> Vec<f64> {
             (0..N * N).map(|k| texture((k % N) as f64 - t[0], (k / N) as f64 - t[1])).collect()

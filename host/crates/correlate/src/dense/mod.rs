@@ -204,7 +204,7 @@ impl Dense {
         let Some(known) = self.lattice(points, sparse, start) else {
             return Vec::new();
         };
-        self.nodes.from_sparse(&tiling, &sparse.columns, &sparse.rows, &known);
+        self.nodes.through_sparse(&tiling, &sparse.columns, &sparse.rows, &known);
         for number in 0..PASSES {
             if number > 0 {
                 self.carry(&tiling, order);

@@ -89,7 +89,13 @@ impl Nodes {
 
     /// Field through sparse points at grid columns `columns` × rows `rows` (ascending): a bilinear
     /// blend of the affine extrapolations of the four around each node.
-    pub(crate) fn from_sparse(&mut self, tiling: &Tiling, columns: &[usize], rows: &[usize], known: &[Warp]) {
+    pub(crate) fn through_sparse(
+        &mut self,
+        tiling: &Tiling,
+        columns: &[usize],
+        rows: &[usize],
+        known: &[Warp],
+    ) {
         self.resize(tiling);
         let place = |k: usize| (columns[k % columns.len()], rows[k / columns.len()]);
         self.common(tiling, known.iter().enumerate().map(|(k, w)| (place(k).0, place(k).1, *w)));
