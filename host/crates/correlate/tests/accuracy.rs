@@ -1,5 +1,7 @@
 //! Bias, scatter and resolution of both solvers.
 
+#![allow(clippy::needless_range_loop)] // arrays of two components
+
 mod common;
 #[path = "common/score.rs"]
 mod score;

@@ -47,7 +47,7 @@ fn texture(kind: usize, seed: f64, x: f64, y: f64) -> f64 {
         // varies along x only
         4 => 100.0 + 50.0 * (0.7 * x).sin(),
         // periodic
-        5 => 128.0 + 60.0 * (0.785_398 * x).sin() * (0.785_398 * y).sin(),
+        5 => 128.0 + 60.0 * (0.78 * x).sin() * (0.78 * y).sin(),
         // an edge
         6 => {
             if x > 20.0 + 0.3 * y {
