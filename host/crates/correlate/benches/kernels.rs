@@ -28,7 +28,6 @@ fn bench(shape: Shape) -> Bench {
 
 fn planes(c: &mut Criterion) {
     let mut b = bench(Shape::Affine);
-    c.benchmark_group("image 512²: load").bench_function("simd", |t| t.iter(|| b.load_plane()));
     for (name, kind) in [
         ("cubic", Interpolation::Cubic),
         ("quintic", Interpolation::Quintic),

@@ -19,6 +19,7 @@ pub struct Bench {
     settings: Settings,
     layout: Layout,
     plane: Plane,
+    between: Plane,
     subset: Subset,
     warped: Vec<f32>,
     scratch: Scratch,
@@ -36,7 +37,7 @@ impl Bench {
         let reference = Reference::new(reference);
         let target = Target::new(deformed, settings.interpolation);
         let mut subset = Subset::default();
-        scalar::load(&mut subset, &layout, &reference, centre.0, centre.1, 2);
+        scalar::load(&mut subset, &layout, &reference, centre.0, centre.1, 2, &[]);
         let at = Sampling {
             x: centre.0 + 1,
             y: centre.1 - 1,
@@ -51,6 +52,7 @@ impl Bench {
             settings,
             layout,
             plane: Plane::default(),
+            between: Plane::default(),
             subset,
             warped: Vec::new(),
             scratch: Scratch::default(),
@@ -59,34 +61,27 @@ impl Bench {
         }
     }
 
-    /// Copies the deformed image into the padded plane: part of every filter below.
-    pub fn load_plane(&mut self) {
-        self.plane.load(&self.target.image, self.target.offset);
-    }
-
     /// Loads and prefilters the deformed image.
     pub fn prefilter(&mut self, kind: Interpolation) {
-        self.load_plane();
-        plane::coefficients(self.level, &mut self.plane, kind);
+        let (image, minus) = (&self.target.image, self.target.offset);
+        plane::coefficients(self.level, image, minus, kind, &mut self.between, &mut self.plane);
     }
 
     /// Loads the deformed image and differentiates along x.
     pub fn gradient_x(&mut self) {
-        self.load_plane();
-        plane::gradient_x(self.level, &mut self.plane);
+        plane::gradient_x(self.level, &self.target.image, self.target.offset, &mut self.plane);
     }
 
     /// Loads the deformed image and differentiates along y.
     pub fn gradient_y(&mut self) {
-        self.load_plane();
-        plane::gradient_y(self.level, &mut self.plane);
+        plane::gradient_y(self.level, &self.target.image, self.target.offset, &mut self.plane);
     }
 
     /// Packs a subset and sums its moments for a shape function of order 1.
     pub fn subset_affine(&mut self) -> f64 {
         let (level, (x, y)) = (self.level, self.centre);
         let (subset, layout, reference) = (&mut self.subset, &self.layout, &self.reference);
-        dispatch!(level, s => subset.load::<_, 1>(s, layout, reference, x, y));
+        dispatch!(level, s => subset.load::<_, 1>(s, layout, reference, x, y, &[]));
         self.subset.sff
     }
 
@@ -94,14 +89,14 @@ impl Bench {
     pub fn subset_quadratic(&mut self) -> f64 {
         let (level, (x, y)) = (self.level, self.centre);
         let (subset, layout, reference) = (&mut self.subset, &self.layout, &self.reference);
-        dispatch!(level, s => subset.load::<_, 2>(s, layout, reference, x, y));
+        dispatch!(level, s => subset.load::<_, 2>(s, layout, reference, x, y, &[]));
         self.subset.sff
     }
 
     /// Scalar reference of [`Bench::subset_affine`] (1) and [`Bench::subset_quadratic`] (2).
     pub fn subset_scalar(&mut self, order: usize) -> f64 {
         let (x, y) = self.centre;
-        scalar::load(&mut self.subset, &self.layout, &self.reference, x, y, order);
+        scalar::load(&mut self.subset, &self.layout, &self.reference, x, y, order, &[]);
         self.subset.sff
     }
 
@@ -120,9 +115,9 @@ impl Bench {
     }
 
     /// Scalar reference of the sweeps.
-    pub fn sweep_scalar(&self, order: usize) -> f64 {
+    pub fn sweep_scalar(&mut self, order: usize) -> f64 {
         let plane = &self.target.coefficients;
-        sum(&scalar::sweep(&self.layout, &self.subset, plane, &self.at, 6, order))
+        sum(&scalar::sweep(&self.layout, &self.subset, plane, &self.at, 6, order, &mut self.warped))
     }
 
     /// Search of one subset over ± `reach` whole pixels by FFT, its plans made.

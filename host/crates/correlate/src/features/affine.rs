@@ -5,7 +5,7 @@ use super::FeatureMatch;
 /// Affine map from the reference to the deformed image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Affine {
-    /// x′ = m[0][0] x + m[0][1] y + m[0][2], y′ likewise from m[1]; pixels.
+    /// `x′ = m[0][0] x + m[0][1] y + m[0][2]`, y′ likewise from `m[1]`; pixels.
     pub target_from_reference: [[f64; 3]; 2],
 }
 
