@@ -22,7 +22,6 @@ pub(crate) fn judge(solver: &Solver<'_>, points: &Points, outcomes: &mut [Option
         .filter(|&k| {
             // a dense point has been held against the field around it, a split one has been confirmed
             // by its own side
-            let split = |o: &Option<Outcome>| o.is_some_and(|o| o.solver == SolvedBy::Split);
             if !accepted(&outcomes[k]) || dense(&outcomes[k]) || split(&outcomes[k]) {
                 return false;
             }
@@ -43,6 +42,47 @@ pub(crate) fn judge(solver: &Solver<'_>, points: &Points, outcomes: &mut [Option
         let chance = chance_groups(solver, points, outcomes, tolerance);
         mark(outcomes, &chance, Status::LowCorrelation);
     }
+    let alone = unsupported(points, outcomes, tolerance);
+    mark(outcomes, &alone, Status::Discontinuous);
+}
+
+/// Split points that no whole subset confirms, neither directly nor through other split points: part
+/// of a subset alone proves too little.
+fn unsupported(points: &Points, outcomes: &[Option<Outcome>], tolerance: f64) -> Vec<usize> {
+    let is_split = |k: usize| accepted(&outcomes[k]) && split(&outcomes[k]);
+    let open: Vec<usize> = (0..outcomes.len()).filter(|&k| is_split(k)).collect();
+    let mut confirmed = vec![false; if open.is_empty() { 0 } else { outcomes.len() }];
+    let mut front: Vec<usize> = open.clone();
+    while !front.is_empty() {
+        let found: Vec<usize> = front
+            .iter()
+            .copied()
+            .filter(|&k| {
+                !confirmed[k]
+                    && points.neighbours(k).iter().any(|&c| {
+                        let c = c as usize;
+                        let supports = accepted(&outcomes[c]) && (!split(&outcomes[c]) || confirmed[c]);
+                        supports && agrees(points, outcomes, k, c, tolerance)
+                    })
+            })
+            .collect();
+        front.clear();
+        for &k in &found {
+            confirmed[k] = true;
+        }
+        for &k in &found {
+            front.extend(
+                points.neighbours(k).iter().map(|&c| c as usize).filter(|&c| is_split(c) && !confirmed[c]),
+            );
+        }
+        front.sort_unstable();
+        front.dedup();
+    }
+    open.into_iter().filter(|&k| !confirmed[k]).collect()
+}
+
+fn split(outcome: &Option<Outcome>) -> bool {
+    outcome.is_some_and(|o| o.solver == SolvedBy::Split)
 }
 
 fn accepted(outcome: &Option<Outcome>) -> bool {
@@ -101,7 +141,7 @@ fn chance_groups(
                 lo[c] = lo[c].min(p[c]);
                 hi[c] = hi[c].max(p[c]);
             }
-            if let Some(o) = &outcomes[k] {
+            if let Some(o) = outcomes[k].filter(|o| o.solver != SolvedBy::Split) {
                 // above what chance alone would need
                 let bar =
                     significant(GROUP_FACTOR * solver.settings.significance, o.independent).min(GROUP_CAP);

@@ -242,6 +242,8 @@ impl Workspace {
         };
         let seeds = first.start(&guess_sparse);
         first.finish(seeds, &guess_sparse);
+        // a sparse point at a wrong place would bend the field of all around it
+        consistency::judge(&solver_sparse, &few, &mut first.outcomes);
         let init = start.elapsed();
         observer.stage(Stage::Solve);
         let proposals = self.dense.solve(

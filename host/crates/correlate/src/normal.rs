@@ -14,7 +14,7 @@ pub(crate) struct Normal {
 }
 
 /// Exponents of the monomials of one displacement component.
-const EXPONENTS: [(usize, usize); 6] = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)];
+pub(crate) const EXPONENTS: [(usize, usize); 6] = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)];
 
 impl Normal {
     /// Normal matrix of a subset, m parameters per component, mean removed; `None` where it is not
@@ -62,6 +62,12 @@ impl Normal {
             l[j][j] = inv;
         }
         Some(Self { n, l })
+    }
+
+    /// Least ratio of a pivot to the same of another matrix.
+    pub(crate) fn least_part_of(&self, other: &Self) -> f64 {
+        // the inverted diagonals are the roots of the pivots' inverses
+        (0..self.n).map(|j| (other.l[j][j] / self.l[j][j]).powi(2)).fold(f64::INFINITY, f64::min)
     }
 
     /// Solves H x = b.

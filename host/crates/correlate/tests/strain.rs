@@ -443,7 +443,7 @@ fn sigma_predicts_correlated_noise() {
 fn sigma_predicts_the_scatter_of_noisy_images() {
     // real subsets of noisy images, not the model they are described with
     const N: usize = 150;
-    const REPEATS: u64 = 16;
+    const REPEATS: u64 = 64;
     let s = Speckles::new(31, N, N);
     let (a, b) = (s.image(N, N, |_, _| (0.0, 0.0)), s.image(N, N, |_, _| (0.2, 0.0)));
     for shape in [Shape::Affine, Shape::Quadratic] {

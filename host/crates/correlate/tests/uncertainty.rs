@@ -20,7 +20,7 @@ struct Tally {
 
 /// Errors and stated variances of all points over all repeats, for both solvers with the noise
 /// estimated and given.
-fn check(shape: Shape, contrasts: [f64; 2], noise: f64, [in_ratio, in_share]: [f64; 2]) {
+fn check(shape: Shape, contrasts: [f64; 2], noise: f64) {
     let s = Speckles::new(20, N, N);
     let scaled = |c: f64, g: Vec<f64>| g.iter().map(|v| c * v).collect::<Vec<_>>();
     let a = scaled(contrasts[0], s.image(N, N, |_, _| (0.0, 0.0)));
@@ -61,27 +61,22 @@ fn check(shape: Shape, contrasts: [f64; 2], noise: f64, [in_ratio, in_share]: [f
                 settings.solver
             );
             // some twenty subsets beside one another × 200 repeats leave 1.1 % of chance
-            assert!((ratio - 1.0).abs() < in_ratio, "{ratio}");
-            assert!((covered - 0.68).abs() < in_share, "{covered}");
+            assert!((ratio - 1.0).abs() < 0.05, "{ratio}");
+            assert!((covered - 0.68).abs() < 0.02, "{covered}");
         }
     }
 }
 
-/// Of stated over seen, and of the share that ±σ covers.
-const LIMITS: [f64; 2] = [0.05, 0.02];
-
 #[test]
 fn sigma_predicts_the_scatter() {
-    for (contrast, noise) in [(2.0, 2.0), (2.0, 5.0), (1.0, 2.0)] {
-        check(Shape::Affine, [contrast; 2], noise, LIMITS);
+    // the last: gradients nearly half of whose energy is noise
+    for (contrast, noise) in [(2.0, 2.0), (2.0, 5.0), (1.0, 2.0), (1.0, 5.0)] {
+        check(Shape::Affine, [contrast; 2], noise);
     }
-    // Nearly half of the gradients' energy is noise: terms of higher order, which the formula leaves
-    // out, make it say 9 % too little (found: 0.914, 63.9 % covered).
-    check(Shape::Affine, [1.0; 2], 5.0, [0.12, 0.06]);
 }
 
 #[test]
 fn sigma_of_other_shapes_and_of_images_of_different_contrast() {
-    check(Shape::Quadratic, [2.0, 2.0], 2.0, LIMITS);
-    check(Shape::Affine, [2.0, 1.2], 2.0, LIMITS);
+    check(Shape::Quadratic, [2.0, 2.0], 2.0);
+    check(Shape::Affine, [2.0, 1.2], 2.0);
 }

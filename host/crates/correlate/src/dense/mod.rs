@@ -40,7 +40,7 @@ const CURVATURE: f64 = 0.33;
 const NEGLIGIBLE: f64 = 0.2;
 /// Share of noise in the energy of the gradients above which a point is left to the exact form: the
 /// dense form's fixed point is drawn towards the field by about this share, and its scatter with it.
-const NOISY: f64 = 0.1;
+const NOISY: f64 = 0.05;
 const NEGLIGIBLE_PX: f64 = 1e-4;
 /// Distance up to which a point's result is good enough to carry the field for the next pass.
 const CARRIES: f32 = 2.0;

@@ -112,6 +112,7 @@ fn run<S: Simd, const N: usize, const N1: usize, const O: usize>(
         .map(|p| Phase { node: (p + lead) / step, t: ((p + lead) % step) as f32 / step as f32, x: powers[p] })
         .collect();
     let spread = Spread::new(step, lead);
+    let places = places(tiling);
     let rem = tiling.whole().1;
     let row_floats = task.tiles * tiling.step * 3;
     let last = tiling.last();
@@ -153,7 +154,7 @@ fn run<S: Simd, const N: usize, const N1: usize, const O: usize>(
             let out = &mut out[j * vectors * size..(j + 1) * vectors * size];
             for (group, (c, o)) in constants.chunks_exact(block).zip(out.chunks_exact_mut(size)).enumerate() {
                 increments::<S, O>(s, pass, &sums.subsets, task.width, group * LANES, c, o);
-                distance::<S, O>(s, pass, task, j, group * LANES, o);
+                distance::<S, O>(s, pass, task, &places, j, group * LANES, o);
             }
         }
     }
@@ -349,40 +350,62 @@ fn increments<S: Simd, const O: usize>(
     gain.store_slice(&mut out[(p + GAIN) * LANES..][..LANES]);
 }
 
-/// Largest difference between eight subsets' polynomials and the field, over the nodes next to the
-/// subset's corners and the middles of its sides.
+/// A place along one axis of the subset, on the nodes of the field.
+struct Place {
+    /// Node before it, counted from the subset's own, and the way from there to the next.
+    node: i32,
+    t: f32,
+    /// In units of the radius.
+    x: f32,
+}
+
+/// Five places from edge to edge.
+fn places(tiling: &Tiling) -> [Place; 5] {
+    let (r, step) = (tiling.radius as f64, tiling.step as f64);
+    [-1.0, -0.5, 0.0, 0.5, 1.0].map(|x| {
+        let at = x * r / step;
+        Place { node: at.floor() as i32, t: (at - at.floor()) as f32, x: x as f32 }
+    })
+}
+
+/// Largest difference between eight subsets' polynomials and the field, over 5 × 5 places from edge to
+/// edge of the subset.
 #[inline(always)]
 fn distance<S: Simd, const O: usize>(
     s: S,
     pass: &Pass<'_>,
     task: &Task,
+    places: &[Place; 5],
     j: usize,
     k: usize,
     out: &mut [f32],
 ) {
-    let tiling = pass.tiling;
     let m = moments(O);
-    let e = tiling.margin();
-    let reach = (tiling.radius / tiling.step).max(1).min(e) as i32;
+    let e = pass.tiling.margin();
+    let stride = pass.nodes.stride;
     let mut worst = V::splat(s, 0.0);
-    let scale = tiling.step as f32 / tiling.radius as f32;
-    macro_rules! parameter {
-        ($a:expr) => {
-            V::from_slice(s, &out[($a) * LANES..($a) * LANES + LANES])
-        };
-    }
-    for (dx, dy) in [(0, 0), (-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)] {
-        let (i, l) = ((dx * reach) as f32 * scale, (dy * reach) as f32 * scale);
-        let basis = [1.0, i, l, i * i, i * l, l * l];
-        let row = (task.row + j + e) as i32 + dy * reach;
-        let column = (task.column + k + e) as i32 + dx * reach;
-        let at = row as usize * pass.nodes.stride + column as usize;
-        for (c, field) in [&pass.nodes.cu, &pass.nodes.cv].into_iter().enumerate() {
-            let mut d = V::splat(s, 0.0) - V::from_slice(s, &field[at..at + LANES]);
-            for a in 0..m {
-                d = V::splat(s, basis[a]).mul_add(parameter!(c * m + a), d);
+    for y in places {
+        let row = ((task.row + j + e) as i32 + y.node) as usize * stride;
+        for x in places {
+            let at = row + ((task.column + k + e) as i32 + x.node) as usize;
+            let basis = [1.0, x.x, y.x, x.x * x.x, x.x * y.x, y.x * y.x];
+            let (tx, ty) = (V::splat(s, x.t), V::splat(s, y.t));
+            for (c, field) in [&pass.nodes.cu, &pass.nodes.cv].into_iter().enumerate() {
+                macro_rules! along {
+                    ($at:expr) => {{
+                        let o = $at;
+                        let a = V::from_slice(s, &field[o..o + LANES]);
+                        (V::from_slice(s, &field[o + 1..o + 1 + LANES]) - a).mul_add(tx, a)
+                    }};
+                }
+                let (upper, lower) = (along!(at), along!(at + stride));
+                let mut d = (upper - lower).mul_add(ty, V::splat(s, 0.0) - upper);
+                for a in 0..m {
+                    let o = (c * m + a) * LANES;
+                    d = V::splat(s, basis[a]).mul_add(V::from_slice(s, &out[o..o + LANES]), d);
+                }
+                worst = worst.max(d.abs());
             }
-            worst = worst.max(d.abs());
         }
     }
     worst.store_slice(&mut out[(2 * m + DISTANCE) * LANES..][..LANES]);

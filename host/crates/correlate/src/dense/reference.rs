@@ -3,6 +3,7 @@
 
 use super::sums::{Group, SumBuffers, flush};
 use super::tiling::{DEGREES, LANES, Task, Tiling, moments, monomial};
+use crate::normal::EXPONENTS;
 use crate::prepared::Reference;
 use crate::sampler::V;
 use crate::simd::dispatch;
@@ -276,9 +277,6 @@ fn factor<S: Simd, const O: usize, const O2: usize>(
         }
     }
 }
-
-/// Exponents of the monomials of one displacement component.
-const EXPONENTS: [(usize, usize); 6] = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)];
 
 /// Factors the normal matrices of eight subsets.
 #[inline(always)]
