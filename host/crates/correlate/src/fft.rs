@@ -31,6 +31,9 @@ impl Window {
     }
 }
 
+/// Rows that are turned into columns together; divides all sizes.
+const BLOCK: usize = 8;
+
 /// Real two-dimensional FFT of a fixed size.
 struct Fft2 {
     nx: usize,
@@ -77,18 +80,24 @@ impl Fft2 {
         self.nx / 2 + 1
     }
 
-    /// Spectrum, stored column after column.
-    fn spectrum(&self, data: &mut [f32]) -> Vec<Complex32> {
+    /// Spectrum, stored column after column, of a plane whose rows from `used` on are zero.
+    fn spectrum(&self, data: &mut [f32], used: usize) -> Vec<Complex32> {
         let (half, ny) = (self.half(), self.ny);
-        let mut row = vec![Complex32::default(); half];
+        let mut rows = vec![Complex32::default(); BLOCK * half];
+        let mut scratch = self.forward.make_scratch_vec();
         let mut out = vec![Complex32::default(); half * ny];
-        for (y, src) in data.chunks_exact_mut(self.nx).enumerate() {
-            // lengths are those of the plan
-            if self.forward.process(src, &mut row).is_err() {
-                continue;
+        let blocks = data.chunks_mut(BLOCK * self.nx).take(used.div_ceil(BLOCK));
+        for (block, src) in blocks.enumerate() {
+            for (row, src) in rows.chunks_exact_mut(half).zip(src.chunks_exact_mut(self.nx)) {
+                // lengths are those of the plan
+                if self.forward.process_with_scratch(src, row, &mut scratch).is_err() {
+                    row.fill(Complex32::default());
+                }
             }
-            for (x, c) in row.iter().enumerate() {
-                out[x * ny + y] = *c;
+            for (x, column) in out.chunks_exact_mut(ny).enumerate() {
+                for (o, row) in column[block * BLOCK..].iter_mut().zip(rows.chunks_exact(half)) {
+                    *o = row[x];
+                }
             }
         }
         self.down.process(&mut out);
@@ -97,24 +106,34 @@ impl Fft2 {
 
     /// Correlation of two planes given by their spectra, not divided by the number of values.
     fn correlated(&self, template: &[Complex32], area: &[Complex32]) -> Vec<f32> {
-        self.plane(template.iter().zip(area).map(|(t, a)| t.conj() * a).collect())
+        self.plane(template.iter().zip(area).map(|(t, a)| t.conj() * a).collect(), |_| true)
     }
 
-    /// Inverse of [`Fft2::spectrum`], not divided by the number of values.
-    fn plane(&self, mut spectrum: Vec<Complex32>) -> Vec<f32> {
+    /// Inverse of [`Fft2::spectrum`], not divided by the number of values; rows that are not wanted are
+    /// zero.
+    fn plane(&self, mut spectrum: Vec<Complex32>, wanted: impl Fn(usize) -> bool) -> Vec<f32> {
         let (half, ny) = (self.half(), self.ny);
         self.up.process(&mut spectrum);
-        let mut row = vec![Complex32::default(); half];
+        let mut rows = vec![Complex32::default(); BLOCK * half];
+        let mut scratch = self.inverse.make_scratch_vec();
         let mut out = vec![0.0; self.nx * ny];
-        for (y, dst) in out.chunks_exact_mut(self.nx).enumerate() {
-            for (x, c) in row.iter_mut().enumerate() {
-                *c = spectrum[x * ny + y];
+        for (block, dst) in out.chunks_mut(BLOCK * self.nx).enumerate() {
+            let first = block * BLOCK;
+            if !(first..first + BLOCK).any(&wanted) {
+                continue;
             }
-            // what a real signal must have there
-            row[0].im = 0.0;
-            row[half - 1].im = 0.0;
-            if self.inverse.process(&mut row, dst).is_err() {
-                dst.fill(0.0);
+            for (x, column) in spectrum.chunks_exact(ny).enumerate() {
+                for (row, c) in rows.chunks_exact_mut(half).zip(&column[first..]) {
+                    row[x] = *c;
+                }
+            }
+            for (row, dst) in rows.chunks_exact_mut(half).zip(dst.chunks_exact_mut(self.nx)) {
+                // what a real signal must have there
+                row[0].im = 0.0;
+                row[half - 1].im = 0.0;
+                if self.inverse.process_with_scratch(row, dst, &mut scratch).is_err() {
+                    dst.fill(0.0);
+                }
             }
         }
         out
@@ -170,14 +189,14 @@ impl Search {
         let under = (!subset.cut.is_empty()).then(|| {
             let mut cut = vec![0.0f32; nx * ny];
             unpack(layout, &subset.cut, nx, &mut cut);
-            let cut = self.fft.spectrum(&mut cut);
+            let cut = self.fft.spectrum(&mut cut, layout.width);
             let mut square: Vec<f32> = area.iter().map(|g| g * g).collect();
-            let square = self.fft.correlated(&cut, &self.fft.spectrum(&mut square));
-            let values = self.fft.correlated(&cut, &self.fft.spectrum(&mut area.clone()));
+            let square = self.fft.correlated(&cut, &self.fft.spectrum(&mut square, rows));
+            let values = self.fft.correlated(&cut, &self.fft.spectrum(&mut area.clone(), rows));
             (values, square)
         });
-        let a = self.fft.spectrum(&mut area);
-        let map = self.fft.correlated(&self.fft.spectrum(&mut template), &a);
+        let a = self.fft.spectrum(&mut area, rows);
+        let map = self.fft.correlated(&self.fft.spectrum(&mut template, layout.width), &a);
         let n = subset.count as f64;
         let w = layout.width;
         let [x0, x1, y0, y1] = subset.extent.map(|e| e as i32 + r);
@@ -292,92 +311,121 @@ pub(crate) fn global_shifts(
 ) -> Vec<[f64; 2]> {
     let largest = reference.width().max(reference.height());
     let factor = largest.div_ceil(side).max(1);
-    let (a, w, h) = reduced(reference, factor);
-    let (b, bw, bh) = reduced(target, factor);
-    if (w, h) != (bw, bh) || w < 4 || h < 4 {
+    let (w, h) = (reference.width() / factor, reference.height() / factor);
+    if (reference.width(), reference.height()) != (target.width(), target.height()) || w < 4 || h < 4 {
         return Vec::new();
     }
     let fft = Fft2::new(2 * w, 2 * h);
-    let spread = |src: &[f32]| {
-        let mut out = vec![0.0; fft.nx * fft.ny];
-        for (o, s) in out.chunks_exact_mut(fft.nx).zip(src.chunks_exact(w)) {
-            o[..w].copy_from_slice(s);
-        }
-        out
-    };
-    let sa = fft.spectrum(&mut spread(&a));
-    let mut product = fft.spectrum(&mut spread(&b));
+    let spectrum = |image: &Image| fft.spectrum(&mut reduced(image, factor, fft.nx, fft.ny), h);
+    let (sa, mut product) = rayon::join(|| spectrum(reference), || spectrum(target));
     for (t, s) in product.iter_mut().zip(&sa) {
         *t *= s.conj();
     }
-    let mut map = fft.plane(product);
-    let (hu, hv) = ((w / 2) as i32, (h / 2) as i32);
-    let place = |u: i32, v: i32| {
-        let x = u.rem_euclid(fft.nx as i32) as usize;
-        v.rem_euclid(fft.ny as i32) as usize * fft.nx + x
+    let (hu, hv) = (w / 2, h / 2);
+    let map = fft.plane(product, |y| y <= hv || y + hv >= fft.ny);
+    // the shifts of interest in one piece; chance correlation grows as the root of the overlap
+    let by_overlap = |half: usize, size: usize| -> Vec<f32> {
+        let overlap = |k: usize| 1.0 - k.abs_diff(half) as f32 / size as f32;
+        (0..=2 * half).map(|k| 1.0 / overlap(k).sqrt()).collect()
     };
+    let (across, down) = (by_overlap(hu, w), by_overlap(hv, h));
+    let width = across.len();
+    let mut likely = Vec::with_capacity(width * down.len());
+    for (j, down) in down.iter().enumerate() {
+        let row = &map[(j + fft.ny - hv) % fft.ny * fft.nx..][..fft.nx];
+        let values = row[fft.nx - hu..].iter().chain(&row[..=hu]);
+        likely.extend(values.zip(&across).map(|(z, a)| z * (a * down)));
+    }
     let mut found = Vec::new();
     for _ in 0..count {
-        let mut best = (f32::NEG_INFINITY, 0, 0);
-        for v in -hv..=hv {
-            for u in -hu..=hu {
-                let overlap = (w as i32 - u.abs()) as f32 * (h as i32 - v.abs()) as f32 / (w * h) as f32;
-                // chance correlation grows as the root of the overlap
-                let z = map[place(u, v)] / overlap.max(0.1).sqrt();
-                if z > best.0 {
-                    best = (z, u, v);
-                }
-            }
-        }
-        if best.0 <= 0.0 {
+        let Some(at) = peak(&likely) else {
             break;
-        }
-        let (u, v) = (best.1, best.2);
-        found.push([f64::from(u) * factor as f64, f64::from(v) * factor as f64]);
+        };
+        let (i, j) = (at % width, at / width);
+        let shift = |k: usize, half: usize| (k as f64 - half as f64) * factor as f64;
+        found.push([shift(i, hu), shift(j, hv)]);
         // what the neighbourhood of this shift covers is no other shift
-        let reach = (apart / factor as i32).max(2);
-        for dv in -reach..=reach {
-            for du in -reach..=reach {
-                map[place(u + du, v + dv)] = f32::NEG_INFINITY;
-            }
+        let reach = (apart as usize / factor).max(2);
+        for row in likely.chunks_exact_mut(width).take(j + reach + 1).skip(j.saturating_sub(reach)) {
+            row[i.saturating_sub(reach)..(i + reach + 1).min(width)].fill(f32::NEG_INFINITY);
         }
     }
     found
 }
 
-fn reduced(image: &Image, factor: usize) -> (Vec<f32>, usize, usize) {
+/// Index of the first largest value, if it is above 0.
+fn peak(values: &[f32]) -> Option<usize> {
+    const CHUNK: usize = 64;
+    let largest = |c: &[f32]| c.iter().fold(0.0f32, |m, &v| if v > m { v } else { m });
+    let mut best = (0.0f32, 0);
+    for (k, c) in values.chunks(CHUNK).enumerate() {
+        let m = largest(c);
+        if m > best.0 {
+            best = (m, k * CHUNK);
+        }
+    }
+    values[best.1..].iter().position(|&v| best.0 > 0.0 && v == best.0).map(|k| best.1 + k)
+}
+
+/// An image averaged over squares of `factor` pixels, less the mean of the 9 × 9 around each value, in
+/// the corner of a plane of zeros of `nx` columns and `ny` rows.
+fn reduced(image: &Image, factor: usize, nx: usize, ny: usize) -> Vec<f32> {
+    const REACH: usize = 4;
     let (w, h) = (image.width() / factor, image.height() / factor);
-    let mut out = vec![0.0f32; w * h];
-    let mut column_sums = vec![0.0f32; image.width()];
-    for (y, out) in out.chunks_exact_mut(w.max(1)).enumerate() {
-        column_sums.fill(0.0);
-        for row in y * factor..(y + 1) * factor {
-            for (o, g) in column_sums.iter_mut().zip(image.row(row)) {
+    let mut mean = vec![0.0f32; w * h];
+    let mut lines = vec![0.0f32; image.width()];
+    let inv = 1.0 / (factor * factor) as f32;
+    for (y, out) in mean.chunks_exact_mut(w).enumerate() {
+        lines.copy_from_slice(image.row(y * factor));
+        for row in y * factor + 1..(y + 1) * factor {
+            for (o, g) in lines.iter_mut().zip(image.row(row)) {
                 *o += g;
             }
         }
-        for (o, c) in out.iter_mut().zip(column_sums.chunks_exact(factor)) {
-            *o = c.iter().sum::<f32>();
+        match factor {
+            2 => binned::<2>(&lines, inv, out),
+            4 => binned::<4>(&lines, inv, out),
+            8 => binned::<8>(&lines, inv, out),
+            _ => out
+                .iter_mut()
+                .zip(lines.chunks_exact(factor))
+                .for_each(|(o, c)| *o = inv * c.iter().sum::<f32>()),
         }
     }
-    let inv = 1.0 / (factor * factor) as f32;
-    out.iter_mut().for_each(|v| *v *= inv);
-    if w == 0 || h == 0 {
-        return (out, w, h);
-    }
-    // minus the mean over 9×9
-    let mean = out.iter().sum::<f32>() / out.len() as f32;
-    out.iter_mut().for_each(|v| *v -= mean);
-    let (sum, _) = integrals(&out, w, w, h);
-    let stride = w + 1;
-    for y in 0..h {
-        let (y0, y1) = (y.saturating_sub(4), (y + 5).min(h));
+    // sums of nine along each row, then of nine rows
+    let count = |k: usize, n: usize| (k + REACH + 1).min(n) - k.saturating_sub(REACH);
+    let around = |sums: &mut [f64], sign: f64, y: usize| {
+        let row = &mean[y * w..(y + 1) * w];
+        let mut s: f64 = row[..REACH.min(w)].iter().map(|&v| f64::from(v)).sum();
         for x in 0..w {
-            let (x0, x1) = (x.saturating_sub(4), (x + 5).min(w));
-            let s =
-                sum[y1 * stride + x1] + sum[y0 * stride + x0] - sum[y0 * stride + x1] - sum[y1 * stride + x0];
-            out[y * w + x] -= (s / ((y1 - y0) * (x1 - x0)) as f64) as f32;
+            s += row.get(x + REACH).map_or(0.0, |&v| f64::from(v));
+            s -= if x > REACH { f64::from(row[x - REACH - 1]) } else { 0.0 };
+            sums[x] += sign * s;
+        }
+    };
+    let columns: Vec<f64> = (0..w).map(|x| 1.0 / count(x, w) as f64).collect();
+    let mut sums = vec![0.0f64; w];
+    (0..REACH.min(h)).for_each(|y| around(&mut sums, 1.0, y));
+    let mut out = vec![0.0f32; nx * ny];
+    for (y, (row, out)) in mean.chunks_exact(w).zip(out.chunks_exact_mut(nx)).enumerate() {
+        if y + REACH < h {
+            around(&mut sums, 1.0, y + REACH);
+        }
+        if y > REACH {
+            around(&mut sums, -1.0, y - REACH - 1);
+        }
+        let rows = 1.0 / count(y, h) as f64;
+        for (((o, v), s), c) in out.iter_mut().zip(row).zip(&sums).zip(&columns) {
+            *o = v - (s * (rows * c)) as f32;
         }
     }
-    (out, w, h)
+    out
+}
+
+/// Sums of N values each, times `scale`.
+fn binned<const N: usize>(values: &[f32], scale: f32, out: &mut [f32]) {
+    let (groups, _) = values.as_chunks::<N>();
+    for (o, g) in out.iter_mut().zip(groups) {
+        *o = scale * g.iter().sum::<f32>();
+    }
 }

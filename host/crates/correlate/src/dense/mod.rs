@@ -27,9 +27,15 @@ use reference::{Layout, Prepared};
 use std::sync::Mutex;
 use tiling::{LANES, Task, Tiling, moments};
 
-/// Passes over the image: the second brings the field of the first to within its own square; a third
-/// changes nothing.
+/// Passes over the image, at most: the second brings the field of the first to within its own square; a
+/// third changes nothing.
 const PASSES: usize = 2;
+/// Error left by the first pass that needs no second, in pixels, or as part of the point's own
+/// uncertainty.
+const SETTLED_PX: f32 = 2e-5;
+const SETTLED: f32 = 0.05;
+/// Share of the points that may be above it: for so few the exact form is cheaper than another pass.
+const UNSETTLED: f32 = 0.02;
 /// Largest distance, in pixels, between a subset's polynomial and the common field at which the dense
 /// form is used at all.
 const LINEAR: f32 = 0.1;
@@ -62,6 +68,46 @@ struct Share {
     task: Task,
     prepared: Prepared,
     out: Vec<f32>,
+    /// Passes that `out` has come from, this time.
+    passes: usize,
+    /// Whether another pass would change nothing that matters.
+    settled: bool,
+}
+
+impl Share {
+    fn new(task: Task) -> Self {
+        Self { task, prepared: Prepared::default(), out: Vec::new(), passes: 0, settled: false }
+    }
+
+    /// Whether the last pass came close enough at nearly all points.
+    fn has_settled(&self, tiling: &Tiling, order: usize) -> bool {
+        let (m, layout) = (moments(order), Layout::new(order));
+        let (size, block) = (outputs(order) * LANES, layout.len() * LANES);
+        let width = (2 * tiling.radius + 1) as f32;
+        let share = SETTLED * SETTLED / (width * width);
+        let vectors = self.task.width / LANES;
+        let mut above = 0;
+        let rows =
+            self.out.chunks_exact(vectors * size).zip(self.prepared.constants.chunks_exact(vectors * block));
+        for (out, constants) in rows {
+            for (k, (q, c)) in out.chunks_exact(size).zip(constants.chunks_exact(block)).enumerate() {
+                let used = LANES.min(self.task.columns.saturating_sub(k * LANES));
+                let q = &q[2 * m * LANES..];
+                let at = |values: &[f32], plane: usize, lane: usize| values[plane * LANES + lane];
+                for lane in 0..used {
+                    let distance = at(q, DISTANCE, lane);
+                    let error = CURVATURE as f32 * distance * distance;
+                    let residual = 2.0 * at(c, layout.sff(), lane) * (1.0 - at(q, ZNCC, lane)).max(0.0);
+                    let variance = at(c, layout.variance(0), lane).min(at(c, layout.variance(1), lane))
+                        * residual
+                        * share;
+                    let close = error <= SETTLED_PX || error * error <= variance;
+                    above += usize::from(!(close && distance < LINEAR));
+                }
+            }
+        }
+        above as f32 <= UNSETTLED * (self.task.rows * self.task.columns) as f32
+    }
 }
 
 /// Memory of the dense form, used again from image to image.
@@ -138,7 +184,7 @@ impl Dense {
                 share.task = *task;
             }
             for task in &tasks[self.shares.len()..] {
-                self.shares.push(Share { task: *task, prepared: Prepared::default(), out: Vec::new() });
+                self.shares.push(Share::new(*task));
             }
         }
         self.first = first;
@@ -146,7 +192,15 @@ impl Dense {
         let buffers = &self.buffers;
         self.shares.par_iter_mut().for_each(|share| {
             with(buffers, |b| {
-                share.prepared.fill(solver.level, &tiling, &share.task, solver.reference, order, &mut b.sums)
+                share.prepared.fill(
+                    solver.level,
+                    &tiling,
+                    &share.task,
+                    solver.reference,
+                    order,
+                    &mut b.sums,
+                    &mut b.line,
+                )
             });
         });
         true
@@ -205,12 +259,19 @@ impl Dense {
             return Vec::new();
         };
         self.nodes.through_sparse(&tiling, &sparse.columns, &sparse.rows, &known);
+        for share in &mut self.shares {
+            (share.passes, share.settled) = (0, false);
+        }
         for number in 0..PASSES {
+            if self.shares.iter().all(|s| s.settled) {
+                break;
+            }
             if number > 0 {
                 self.carry(&tiling, order);
             }
             let pass = Pass {
                 tiling: &tiling,
+                reference: solver.reference,
                 nodes: &self.nodes,
                 plane: &solver.target.coefficients,
                 criterion: solver.settings.criterion,
@@ -218,11 +279,13 @@ impl Dense {
                 order,
             };
             let buffers = &self.buffers;
-            self.shares.par_iter_mut().for_each(|share| {
+            self.shares.par_iter_mut().filter(|s| !s.settled).for_each(|share| {
                 if !observer.cancelled() {
                     with(buffers, |b| {
                         pass.run(solver.level, &share.task, &share.prepared, b, &mut share.out)
                     });
+                    share.passes = number + 1;
+                    share.settled = share.has_settled(&tiling, order);
                 }
             });
             if observer.cancelled() {
@@ -461,7 +524,7 @@ impl Dense {
                     warp,
                     zncc,
                     independent,
-                    iterations: PASSES as u16,
+                    iterations: share.passes as u16,
                     status: Status::Converged,
                     solver: SolvedBy::Dense,
                     sigma,

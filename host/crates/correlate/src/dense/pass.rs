@@ -7,11 +7,12 @@
 //! subset's own polynomial is not neglected, only the square of the difference is.
 
 use super::nodes::Nodes;
-use super::reference::{self, FIELD_BLOCK, Prepared, corner};
+use super::reference::{self, FIELD_BLOCK, Line, Prepared, corner, lines};
 use super::sums::{Group, SumBuffers, flush};
 use super::tiling::{DEGREES, LANES, Task, Tiling, moments};
 use super::warp::{RowField, Spread, warp_row};
 use crate::plane::Plane;
+use crate::prepared::Reference;
 use crate::sampler::V;
 use crate::settings::{Criterion, Interpolation};
 use crate::simd::dispatch;
@@ -36,6 +37,7 @@ pub(crate) const fn outputs(order: usize) -> usize {
 #[derive(Default)]
 pub(crate) struct Buffers {
     pub(crate) sums: SumBuffers,
+    pub(crate) line: Line,
     rows: Rows,
 }
 
@@ -53,6 +55,7 @@ struct Rows {
 /// What is common to all tasks of a pass.
 pub(crate) struct Pass<'a> {
     pub(crate) tiling: &'a Tiling,
+    pub(crate) reference: &'a Reference,
     pub(crate) nodes: &'a Nodes,
     pub(crate) plane: &'a Plane,
     /// Reference grey levels hold f − `f_offset`, coefficients g − `g_offset`.
@@ -103,7 +106,7 @@ fn run<S: Simd, const N: usize, const N1: usize, const O: usize>(
     let tiling = pass.tiling;
     let groups = [Group { count: 4, degree: O }, Group { count: 4, degree: 0 }];
     let planes = groups.iter().map(|g| g.planes()).sum();
-    let Buffers { sums, rows } = buffers;
+    let Buffers { sums, rows, line } = buffers;
     sums.prepare(tiling, task, planes);
     rows.prepare(tiling, task);
     let powers: Vec<[f32; DEGREES]> = (0..tiling.step).map(|p| tiling.powers(p)).collect();
@@ -114,37 +117,32 @@ fn run<S: Simd, const N: usize, const N1: usize, const O: usize>(
     let spread = Spread::new(step, lead);
     let places = places(tiling);
     let rem = tiling.whole().1;
-    let row_floats = task.tiles * tiling.step * 3;
     let last = tiling.last();
-    let mut fields = data.fields.chunks_exact(row_floats);
+    let mut next = 0..lines(tiling, task);
     let block = reference::Layout::new(O).len() * LANES;
     let (x, y) = corner(tiling, task);
     let (x, y) = (x + pass.nodes.base[0], y + pass.nodes.base[1]);
-    let mut line = 0;
     for b in 0..task.rows + last {
-        sums.begin();
         let whole = b + 1 < task.rows + last || rem == 0;
-        let mut summed = 0;
-        while summed < if whole { tiling.step } else { rem } {
-            if summed == rem {
-                sums.keep_part();
+        for down in 0..if whole { step } else { rem } {
+            if down == rem {
+                sums.part(s, tiling, task, &groups, b);
             }
-            if let Some(f) = fields.next() {
-                rows.field(s, tiling, task, pass.nodes, line);
+            if let Some(n) = next.next() {
+                line.load(tiling, task, pass.reference, n);
+                rows.field(s, tiling, task, pass.nodes, n);
                 let Rows { g, g_split, nodes } = &mut *rows;
                 let [[u, su], [v, sv], ..] = &*nodes;
                 let field = RowField { u, su, v, sv, spread: &spread };
-                warp_row::<S, N, N1>(s, pass.plane, x, y + line as i32, &field, g);
-                reference::split(tiling.step, g, LANES, 0, g_split);
-                let stride = task.tiles;
-                let input = Input { fields: f, g: g_split, nodes, phases: &phases, rem };
-                accumulate::<S, O>(s, &input, &powers[summed], &mut sums.tiles, stride);
+                warp_row::<S, N, N1>(s, pass.plane, x, y + n as i32, &field, g);
+                reference::split(step, g, LANES, 0, g_split);
+                let input = Input { fields: &line.fields, g: g_split, nodes, phases: &phases, rem };
+                let y = (&powers[down], down == 0);
+                accumulate::<S, O>(s, &input, y, &mut sums.tiles, task.tiles);
             }
-            line += 1;
-            summed += 1;
         }
         if !whole {
-            sums.keep_part();
+            sums.part(s, tiling, task, &groups, b);
         }
         if sums.close(s, tiling, task, &groups, b, whole) {
             let j = b - last;
@@ -219,7 +217,7 @@ struct Input<'a> {
 fn accumulate<S: Simd, const O: usize>(
     s: S,
     input: &Input<'_>,
-    y: &[f32; DEGREES],
+    (y, is_first): (&[f32; DEGREES], bool),
     tiles: &mut [f32],
     stride: usize,
 ) {
@@ -273,11 +271,11 @@ fn accumulate<S: Simd, const O: usize>(
             ($tiles:expr) => {{
                 let mut planes = &mut *$tiles;
                 for c in &a {
-                    flush::<S, O>(s, c, y, planes, stride, k);
+                    flush::<S, O>(s, is_first, c, y, planes, stride, k);
                     planes = &mut planes[moments(O) * stride..];
                 }
                 for c in &q {
-                    flush::<S, 0>(s, std::slice::from_ref(c), y, planes, stride, k);
+                    flush::<S, 0>(s, is_first, std::slice::from_ref(c), y, planes, stride, k);
                     planes = &mut planes[stride..];
                 }
             }};

@@ -68,8 +68,6 @@ impl Layout {
 /// One task's share of the reference.
 #[derive(Default, Clone)]
 pub(crate) struct Prepared {
-    /// Per row of pixels, eight tiles and phase: eight values each of f, fx, fy.
-    pub(crate) fields: Vec<f32>,
     /// Per row of nodes and eight nodes: the constants of [`Layout`]. Σ (f − mean)² is negative where
     /// the normal equations are not safely solvable.
     pub(crate) constants: Vec<f32>,
@@ -130,37 +128,46 @@ impl Prepared {
         reference: &Reference,
         order: usize,
         buffers: &mut SumBuffers,
+        line: &mut Line,
     ) {
-        self.load(tiling, task, reference);
         let block = Layout::new(order).len() * LANES;
         self.constants.resize(task.rows * task.width / LANES * block, 0.0);
         match order {
-            0 => dispatch!(level, s => factor::<_, 0, 0>(s, self, tiling, task, buffers)),
-            1 => dispatch!(level, s => factor::<_, 1, 2>(s, self, tiling, task, buffers)),
-            _ => dispatch!(level, s => factor::<_, 2, 4>(s, self, tiling, task, buffers)),
+            0 => dispatch!(level, s => factor::<_, 0, 0>(s, self, tiling, task, reference, buffers, line)),
+            1 => dispatch!(level, s => factor::<_, 1, 2>(s, self, tiling, task, reference, buffers, line)),
+            _ => dispatch!(level, s => factor::<_, 2, 4>(s, self, tiling, task, reference, buffers, line)),
         }
     }
+}
 
-    fn load(&mut self, tiling: &Tiling, task: &Task, reference: &Reference) {
+/// Grey levels and gradients of one row of pixels.
+#[derive(Default)]
+pub(crate) struct Line {
+    row: Vec<f32>,
+    /// Per eight tiles and phase: eight values each of f, fx, fy.
+    pub(crate) fields: Vec<f32>,
+}
+
+impl Line {
+    /// Loads row `line` of a task's pixels.
+    #[inline(always)]
+    pub(crate) fn load(&mut self, tiling: &Tiling, task: &Task, reference: &Reference, line: usize) {
         let (x, y) = corner(tiling, task);
         let pixels = task.tiles * tiling.step;
-        let row_floats = pixels * FIELDS;
-        self.fields.resize(lines(tiling, task) * row_floats, 0.0);
+        self.row.resize(pixels, 0.0);
+        self.fields.resize(pixels * FIELDS, 0.0);
         let image = &reference.image;
         let used = pixels.min(image.width().saturating_sub(x as usize));
-        let mut row = vec![0.0f32; pixels];
-        for (d, out) in self.fields.chunks_exact_mut(row_floats).enumerate() {
-            let py = y as usize + d;
-            let src = &image.row(py)[x as usize..x as usize + used];
-            for (o, f) in row.iter_mut().zip(src) {
-                *o = f - reference.mean;
-            }
-            split(tiling.step, &row, FIELD_BLOCK, 0, out);
-            for (c, plane) in [&reference.gx, &reference.gy].into_iter().enumerate() {
-                let at = plane.index(x, py as i32);
-                row[..used].copy_from_slice(&plane.data[at..at + used]);
-                split(tiling.step, &row, FIELD_BLOCK, (c + 1) * LANES, out);
-            }
+        let y = y as usize + line;
+        let src = &image.row(y)[x as usize..x as usize + used];
+        for (o, f) in self.row.iter_mut().zip(src) {
+            *o = f - reference.mean;
+        }
+        split(tiling.step, &self.row, FIELD_BLOCK, 0, &mut self.fields);
+        for (c, plane) in [&reference.gx, &reference.gy].into_iter().enumerate() {
+            let at = plane.index(x, y as i32);
+            self.row[..used].copy_from_slice(&plane.data[at..at + used]);
+            split(tiling.step, &self.row, FIELD_BLOCK, (c + 1) * LANES, &mut self.fields);
         }
     }
 }
@@ -173,7 +180,7 @@ fn accumulate<S: Simd, const O: usize, const O2: usize>(
     tiling: &Tiling,
     fields: &[f32],
     x: &[[f32; DEGREES]],
-    y: &[f32; DEGREES],
+    (y, is_first): (&[f32; DEGREES], bool),
     tiles: &mut [f32],
     stride: usize,
 ) {
@@ -215,15 +222,15 @@ fn accumulate<S: Simd, const O: usize, const O2: usize>(
             }
             let mut planes = if is_part { &mut *part } else { &mut *whole };
             for q in &a {
-                flush::<S, O2>(s, q, y, planes, stride, k);
+                flush::<S, O2>(s, is_first, q, y, planes, stride, k);
                 planes = &mut planes[moments(O2) * stride..];
             }
             for q in &g {
-                flush::<S, O>(s, q, y, planes, stride, k);
+                flush::<S, O>(s, is_first, q, y, planes, stride, k);
                 planes = &mut planes[moments(O) * stride..];
             }
             for q in &f {
-                flush::<S, 0>(s, std::slice::from_ref(q), y, planes, stride, k);
+                flush::<S, 0>(s, is_first, std::slice::from_ref(q), y, planes, stride, k);
                 planes = &mut planes[stride..];
             }
         }
@@ -240,33 +247,32 @@ fn factor<S: Simd, const O: usize, const O2: usize>(
     data: &mut Prepared,
     tiling: &Tiling,
     task: &Task,
+    reference: &Reference,
     buffers: &mut SumBuffers,
+    line: &mut Line,
 ) {
     let groups = groups(O);
     let planes = groups.iter().map(|g| g.planes()).sum();
     buffers.prepare(tiling, task, planes);
     let powers: Vec<[f32; DEGREES]> = (0..tiling.step).map(|p| tiling.powers(p)).collect();
     let rem = tiling.whole().1;
-    let row_floats = task.tiles * tiling.step * FIELDS;
     let last = tiling.last();
-    let mut rows = data.fields.chunks_exact(row_floats);
+    let mut next = 0..lines(tiling, task);
     let block = Layout::new(O).len() * LANES;
     for b in 0..task.rows + last {
-        buffers.begin();
         let whole = b + 1 < task.rows + last || rem == 0;
-        let mut summed = 0;
-        while summed < if whole { tiling.step } else { rem } {
-            if summed == rem {
-                buffers.keep_part();
+        for y in 0..if whole { tiling.step } else { rem } {
+            if y == rem {
+                buffers.part(s, tiling, task, &groups, b);
             }
-            if let Some(fields) = rows.next() {
-                let y = &powers[summed];
-                accumulate::<S, O, O2>(s, tiling, fields, &powers, y, &mut buffers.tiles, task.tiles);
+            if let Some(n) = next.next() {
+                line.load(tiling, task, reference, n);
+                let y = (&powers[y], y == 0);
+                accumulate::<S, O, O2>(s, tiling, &line.fields, &powers, y, &mut buffers.tiles, task.tiles);
             }
-            summed += 1;
         }
         if !whole {
-            buffers.keep_part();
+            buffers.part(s, tiling, task, &groups, b);
         }
         if buffers.close(s, tiling, task, &groups, b, whole) {
             let row = (b - last) * task.width / LANES * block;

@@ -43,10 +43,9 @@ impl Group {
 /// Working memory of one thread.
 #[derive(Default)]
 pub(crate) struct SumBuffers {
-    /// Sums of the current row of tiles: whole tiles, then their first `rem` columns.
+    /// Sums of the current row of tiles: whole tiles, then their first `rem` columns. The first row of
+    /// pixels replaces what is there.
     pub(crate) tiles: Vec<f32>,
-    /// The same after the first `rem` rows of the tiles.
-    part: Vec<f32>,
     /// The last q rows of tiles summed along x, and the partial row after them.
     ring: Vec<f32>,
     /// Sums of one row of subsets.
@@ -63,7 +62,6 @@ impl SumBuffers {
     pub(crate) fn prepare(&mut self, tiling: &Tiling, task: &Task, planes: usize) {
         let (q, rem) = tiling.whole();
         self.tiles.resize(2 * planes * task.tiles, 0.0);
-        self.part.resize(2 * planes * task.tiles, 0.0);
         self.ring.resize((q + usize::from(rem > 0)) * planes * task.width, 0.0);
         self.subsets.resize(planes * task.width, 0.0);
         self.shifts.clear();
@@ -71,14 +69,16 @@ impl SumBuffers {
         self.turned.clone_from(&self.shifts);
     }
 
-    /// Begins a row of tiles.
-    pub(crate) fn begin(&mut self) {
-        self.tiles.fill(0.0);
-    }
-
-    /// Keeps what the first `rem` rows of the tiles have given.
-    pub(crate) fn keep_part(&mut self) {
-        self.part.copy_from_slice(&self.tiles);
+    /// Takes what the first `rem` rows of row of tiles `b` have given; the sums of the row of subsets
+    /// that ends there follow.
+    #[inline(always)]
+    pub(crate) fn part<S: Simd>(&mut self, s: S, tiling: &Tiling, task: &Task, groups: &[Group], b: usize) {
+        let (q, rem) = tiling.whole();
+        if rem > 0 && b >= tiling.last() {
+            let slot = self.subsets.len();
+            along_x(s, tiling, task, groups, &self.shifts, &self.tiles, &mut self.ring[q * slot..]);
+            down(s, self, tiling, task, groups, b);
+        }
     }
 
     /// Closes row of tiles `b`, of which only the first rows were summed unless `whole`; whether the
@@ -96,11 +96,6 @@ impl SumBuffers {
         let (q, rem) = tiling.whole();
         let slot = self.subsets.len();
         let full = b >= tiling.last();
-        if rem > 0 && full {
-            let out = &mut self.ring[q * slot..];
-            along_x(s, tiling, task, groups, &self.shifts, &self.part, out);
-            down(s, self, tiling, task, groups, b);
-        }
         if whole {
             let at = b % q * slot;
             along_x(s, tiling, task, groups, &self.shifts, &self.tiles, &mut self.ring[at..at + slot]);
@@ -225,10 +220,12 @@ fn along_x<S: Simd>(
     each_batch!(groups, |j, e| monomial(e, j), batch);
 }
 
-/// Adds the sums over one row of pixels, x-powers in `acc`, to the planes of one quantity.
+/// Adds the sums over one row of pixels, x-powers in `acc`, to the planes of one quantity; the `first`
+/// row replaces what was there.
 #[inline(always)]
 pub(crate) fn flush<S: Simd, const D: usize>(
     s: S,
+    first: bool,
     acc: &[V<S>],
     y: &[f32; DEGREES],
     planes: &mut [f32],
@@ -239,7 +236,7 @@ pub(crate) fn flush<S: Simd, const D: usize>(
         for j in 0..=D - i {
             let at = monomial(i, j) * stride + k;
             let p = &mut planes[at..at + LANES];
-            let old = V::from_slice(s, p);
+            let old = if first { V::splat(s, 0.0) } else { V::from_slice(s, p) };
             let new = if j == 0 { old + acc[i] } else { V::splat(s, y[j]).mul_add(acc[i], old) };
             new.store_slice(p);
         }
