@@ -1,5 +1,5 @@
 //! Points per second of a correlation: `speed REF DEF [subset] [step] [order] [csv] [repeats] [exact|dense|auto]
-//! [cubic|quintic|septic]`, one thread. Everything from the 8-bit pixels on is counted.
+//! [cubic|quintic|septic] [threads]`, one thread by default. Everything from the 8-bit grey levels on is counted.
 
 use daic_correlate::*;
 use std::io::Write;
@@ -18,15 +18,27 @@ fn cpu() -> f64 {
         * 1e-9
 }
 
-fn load(path: &str) -> Image {
-    let i = image::open(path).expect("an image").to_luma8();
-    Image::from_u8(i.width() as usize, i.height() as usize, i.as_raw()).expect("a size")
+struct Grey {
+    width: usize,
+    height: usize,
+    pixels: Vec<u8>,
+}
+
+impl Grey {
+    fn load(path: &str) -> Self {
+        let i = image::open(path).expect("an image").to_luma8();
+        Self { width: i.width() as usize, height: i.height() as usize, pixels: i.into_raw() }
+    }
+
+    fn image(&self) -> Image {
+        Image::from_u8(self.width, self.height, &self.pixels).expect("a size")
+    }
 }
 
 fn main() {
     let args: Vec<String> = std::env::args().collect();
     let number = |k: usize, d: usize| args.get(k).map_or(d, |a| a.parse().expect("a number"));
-    let (a, b) = (load(&args[1]), load(&args[2]));
+    let (a, b) = (Grey::load(&args[1]), Grey::load(&args[2]));
     let shape = match number(5, 1) {
         0 => Shape::Translation,
         1 => Shape::Affine,
@@ -46,21 +58,22 @@ fn main() {
     let mut workspace = Workspace::new();
     let mut kept: Option<(Reference, Target)> = None;
     let roi = Roi {
-        rectangle: Some(Rectangle { x: 40, y: 40, width: a.width() - 80, height: a.height() - 80 }),
+        rectangle: Some(Rectangle { x: 40, y: 40, width: a.width - 80, height: a.height - 80 }),
         mask: None,
     };
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread");
-    let points = Points::grid(a.width(), a.height(), settings.subset, number(4, 5), &roi).expect("a grid");
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(number(10, 1)).build().expect("a thread");
+    let points = Points::grid(a.width, a.height, settings.subset, number(4, 5), &roi).expect("a grid");
     for _ in 0..number(7, 3) {
-        let (a, b) = (a.clone(), b.clone());
         let (start, cpu0) = (Instant::now(), cpu());
         let (c, prepare) = pool.install(|| {
             match &mut kept {
                 Some((reference, target)) => {
-                    reference.update(a);
-                    target.update(b);
+                    reference.assign(a.width, a.height, a.width, &a.pixels).expect("a size");
+                    target.assign(b.width, b.height, b.width, &b.pixels).expect("a size");
                 }
-                none => *none = Some((Reference::new(a), Target::new(b, settings.interpolation))),
+                none => {
+                    *none = Some((Reference::new(a.image()), Target::new(b.image(), settings.interpolation)))
+                }
             }
             let Some((reference, target)) = &kept else { unreachable!("made above") };
             let prepare = start.elapsed();
@@ -72,7 +85,7 @@ fn main() {
         let total = cpu() - cpu0;
         let iterations: u32 = c.points.iter().map(|p| u32::from(p.iterations)).sum();
         println!(
-            "{} points, {} ok, {} dense, prepare {:.1} ms, init {:.1} ms, solve {:.1} ms, {:.2} iterations: {:.0} points/CPU-s ({})",
+            "{} points, {} ok, {} dense, prepare {:.1} ms, init {:.1} ms, solve {:.1} ms, {:.2} iterations: {:.0} points/CPU-s, {:.0} points/s ({})",
             points.len(),
             c.converged(),
             c.points.iter().filter(|p| p.solver == SolvedBy::Dense && p.status.is_ok()).count(),
@@ -81,6 +94,7 @@ fn main() {
             c.timing.solve.as_secs_f64() * 1e3,
             f64::from(iterations) / points.len() as f64,
             points.len() as f64 / total,
+            points.len() as f64 / (prepare + c.timing.init + c.timing.solve).as_secs_f64(),
             simd_level(),
         );
         if let Some(path) = args.get(6).filter(|p| *p != "-") {

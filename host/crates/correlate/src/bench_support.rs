@@ -19,7 +19,6 @@ pub struct Bench {
     settings: Settings,
     layout: Layout,
     plane: Plane,
-    between: Plane,
     subset: Subset,
     warped: Vec<f32>,
     scratch: Scratch,
@@ -52,7 +51,6 @@ impl Bench {
             settings,
             layout,
             plane: Plane::default(),
-            between: Plane::default(),
             subset,
             warped: Vec::new(),
             scratch: Scratch::default(),
@@ -64,7 +62,7 @@ impl Bench {
     /// Loads and prefilters the deformed image.
     pub fn prefilter(&mut self, kind: Interpolation) {
         let (image, minus) = (&self.target.image, self.target.offset);
-        plane::coefficients(self.level, image, minus, kind, &mut self.between, &mut self.plane);
+        plane::coefficients(self.level, image, minus, kind, &mut self.plane);
     }
 
     /// Loads the deformed image and differentiates along x.

@@ -22,12 +22,12 @@ use fearless_simd_macros::simd;
 pub(crate) const OVERHANG: f64 = (PAD - 12) as f64;
 /// How far a converged subset may overhang: half a pixel, so that noise does not decide on
 /// subsets which touch the border.
-const BORDER: f64 = 0.5;
+pub(crate) const BORDER: f64 = 0.5;
 
 /// Share of noise in the energy of the gradients above which it is taken out of the normal matrix.
 const EXCESS: f64 = 0.1;
 /// Largest such share that can be told from all of it.
-const MOST_EXCESS: f64 = 0.8;
+pub(crate) const MOST_EXCESS: f64 = 0.8;
 
 /// All that is common to the points of one run.
 pub(crate) struct Solver<'a> {
@@ -280,7 +280,7 @@ impl<'a> Solver<'a> {
 
     /// Whether a ZNCC reaches [`Solver::threshold`].
     #[inline(always)]
-    fn clears(&self, zncc: f64, independent: f64) -> bool {
+    pub(crate) fn clears(&self, zncc: f64, independent: f64) -> bool {
         // tanh x < x saves nearly all points the function
         let above = zncc >= self.settings.min_zncc;
         let x2 = self.settings.significance.powi(2) / (independent - 3.0).max(1.0);
@@ -351,13 +351,18 @@ impl<'a> Solver<'a> {
         match self.settings.noise {
             Some(s) => s * s,
             None => {
-                let m = self.settings.shape.parameters_per_component();
-                // offset, and gain where it is free
-                let levels = if self.settings.criterion == Criterion::Znssd { 2.0 } else { 1.0 };
-                let freedom = (numbers.count - levels - 2.0 * m as f64).max(1.0);
-                numbers.left.max(0.0) / freedom / (1.0 + numbers.gain * numbers.gain * passed)
+                let spread = 1.0 + numbers.gain * numbers.gain * passed;
+                numbers.left.max(0.0) / self.freedom(numbers.count) / spread
             }
         }
+    }
+
+    /// Degrees of freedom of the residuals of a subset of `count` pixels.
+    pub(crate) fn freedom(&self, count: f64) -> f64 {
+        let m = self.settings.shape.parameters_per_component();
+        // offset, and gain where it is free
+        let levels = if self.settings.criterion == Criterion::Znssd { 2.0 } else { 1.0 };
+        (count - levels - 2.0 * m as f64).max(1.0)
     }
 
     /// As [`Solver::sigma`] where noise makes up so much of the gradients that its part of the normal

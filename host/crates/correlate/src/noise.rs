@@ -15,7 +15,7 @@ const HARMONICS: usize = 4;
 pub(crate) struct NoiseGain {
     /// Σ h(t + k)² over all k, the variance of an interpolated value per unit of pixel variance along
     /// one axis, as a Fourier series in t: Σ aₖ cos 2πkt.
-    series: [f64; HARMONICS],
+    pub(crate) series: [f64; HARMONICS],
     /// Σ h′(k)² of the quintic: the variance of a gradient value.
     pub(crate) gradient: f64,
 }

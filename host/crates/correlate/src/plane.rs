@@ -86,26 +86,12 @@ impl<const P: usize> Spline<P> {
     }
 }
 
-/// Coefficients of the interpolating B-spline of an image less `minus`; `between` is memory for the
-/// work.
-pub(crate) fn coefficients(
-    level: Level,
-    image: &Image,
-    minus: f32,
-    kind: Interpolation,
-    between: &mut Plane,
-    out: &mut Plane,
-) {
-    macro_rules! filter {
-        ($spline:expr) => {{
-            along_rows(level, image, minus, &$spline, false, between);
-            along_columns(level, &Source::Plane(between), image, &$spline, false, out);
-        }};
-    }
+/// Coefficients of the interpolating B-spline of an image less `minus`.
+pub(crate) fn coefficients(level: Level, image: &Image, minus: f32, kind: Interpolation, out: &mut Plane) {
     match kind {
-        Interpolation::Cubic => filter!(CUBIC),
-        Interpolation::Quintic => filter!(QUINTIC),
-        Interpolation::Septic => filter!(SEPTIC),
+        Interpolation::Cubic => along_both(level, image, minus, &CUBIC, out),
+        Interpolation::Quintic => along_both(level, image, minus, &QUINTIC, out),
+        Interpolation::Septic => along_both(level, image, minus, &SEPTIC, out),
     }
 }
 
@@ -116,7 +102,7 @@ pub(crate) fn gradient_x(level: Level, image: &Image, minus: f32, out: &mut Plan
 
 /// d/dy of the interpolating quintic at the pixel centres.
 pub(crate) fn gradient_y(level: Level, image: &Image, minus: f32, out: &mut Plane) {
-    along_columns(level, &Source::Image(minus), image, &QUINTIC, true, out);
+    along_columns(level, image, minus, &QUINTIC, out);
 }
 
 /// One image row less a constant, mirrored at both ends.
@@ -153,44 +139,36 @@ fn along_rows<const P: usize>(
     });
 }
 
-/// What a filter down the columns reads.
-enum Source<'a> {
-    /// The image, less a constant.
-    Image(f32),
-    Plane(&'a Plane),
-}
-
-impl Source<'_> {
-    /// Columns x..x + COLUMNS of row y; rows beyond the padding repeat the last one.
-    fn read(&self, image: &Image, rows: usize, x: usize, y: i64, out: &mut [f32]) {
-        let y = y.clamp(0, rows as i64 - 1) as usize;
-        match self {
-            Source::Plane(p) => out.copy_from_slice(&p.data[y * p.stride + x..][..COLUMNS]),
-            Source::Image(minus) => {
-                let src = image.row(mirror(y, image.height()));
-                let w = src.len();
-                if x >= PAD && x + COLUMNS <= PAD + w {
-                    for (o, &v) in out.iter_mut().zip(&src[x - PAD..]) {
-                        *o = v - minus;
-                    }
-                } else {
-                    for (i, o) in out.iter_mut().enumerate() {
-                        *o = src[mirror(x + i, w)] - minus;
-                    }
-                }
-            }
-        }
-    }
-}
-
 /// Slabs of rows are filtered by themselves, each from `run_in` rows before it to as many after: the
-/// result does not depend on who filters which, and a slab's columns stay in the first-level cache.
+/// result does not depend on who filters which. The rows go through the filter along them first, in
+/// memory that is no larger than a slab.
+fn along_both<const P: usize>(level: Level, image: &Image, minus: f32, spline: &Spline<P>, out: &mut Plane) {
+    out.resize(image);
+    let (stride, rows) = (out.stride, out.rows);
+    let memory = || (vec![0.0f32; stride * (SLAB + 2 * spline.run_in)], vec![0.0f32; 2 * stride * STRIP]);
+    let slabs = out.data.par_chunks_mut(stride * SLAB).enumerate();
+    slabs.for_each_init(memory, |(between, strip), (k, slab)| {
+        let first = (k * SLAB) as i64 - spline.run_in as i64;
+        for (i, lines) in between.chunks_exact_mut(stride * STRIP).enumerate() {
+            for (j, row) in lines.chunks_exact_mut(stride).enumerate() {
+                let y = (first + (i * STRIP + j) as i64).clamp(0, rows as i64 - 1) as usize;
+                load_row(image.row(mirror(y, image.height())), minus, row);
+            }
+            dispatch!(level, s => filter_rows::<_, P>(s, stride, lines, spline, false, strip));
+        }
+        dispatch!(level, s => filter_columns::<_, P>(s, between, stride, spline));
+        let used = spline.run_in * stride;
+        slab.copy_from_slice(&between[used..used + slab.len()]);
+    });
+}
+
+/// d/dy, a slab at a time as in [`along_both`], and of a slab as many columns as stay in the first-level
+/// cache.
 fn along_columns<const P: usize>(
     level: Level,
-    source: &Source<'_>,
     image: &Image,
+    minus: f32,
     spline: &Spline<P>,
-    difference: bool,
     out: &mut Plane,
 ) {
     out.resize(image);
@@ -201,9 +179,13 @@ fn along_columns<const P: usize>(
         for x in (0..stride).step_by(COLUMNS) {
             let first = (k * SLAB) as i64 - spline.run_in as i64;
             for (i, row) in memory.chunks_exact_mut(COLUMNS).enumerate() {
-                source.read(image, rows, x, first + i as i64, row);
+                let y = (first + i as i64).clamp(0, rows as i64 - 1) as usize;
+                read(image.row(mirror(y, image.height())), minus, x, row);
             }
-            dispatch!(level, s => filter_columns::<_, P>(s, memory, spline, difference));
+            dispatch!(level, s => {
+                filter_columns::<_, P>(s, memory, COLUMNS, spline);
+                difference::<_, P>(s, memory, spline);
+            });
             for (i, row) in slab.chunks_exact_mut(stride).enumerate() {
                 let at = (i + spline.run_in) * COLUMNS;
                 row[x..x + COLUMNS].copy_from_slice(&memory[at..at + COLUMNS]);
@@ -212,36 +194,55 @@ fn along_columns<const P: usize>(
     });
 }
 
-/// Recursive prefilter down [`COLUMNS`] columns. All poles share one sweep down and one up; the
-/// derivative, where asked for, follows the sweep up.
+/// Columns x..x + COLUMNS of a padded row.
+fn read(src: &[f32], minus: f32, x: usize, out: &mut [f32]) {
+    let w = src.len();
+    if x >= PAD && x + COLUMNS <= PAD + w {
+        for (o, &v) in out.iter_mut().zip(&src[x - PAD..]) {
+            *o = v - minus;
+        }
+    } else {
+        for (i, o) in out.iter_mut().enumerate() {
+            *o = src[mirror(x + i, w)] - minus;
+        }
+    }
+}
+
+/// Recursive prefilter down the columns of a plane, [`COLUMNS`] at a time. All poles share one sweep
+/// down and one up.
 #[simd]
-fn filter_columns<S: Simd, const P: usize>(s: S, data: &mut [f32], spline: &Spline<P>, difference: bool) {
+fn filter_columns<S: Simd, const P: usize>(s: S, data: &mut [f32], stride: usize, spline: &Spline<P>) {
     const VECTORS: usize = COLUMNS / LANES;
     let v = |a: f32| f32x8::splat(s, a);
     let gain = v(spline.gain());
     let recursion = Recursion::new(s, spline);
-    let mut a = [[v(0.0); P]; VECTORS];
-    for k in 0..VECTORS {
-        a[k] = recursion.settled(f32x8::from_slice(s, &data[LANES * k..][..LANES]));
-    }
-    let mut last = [v(0.0); VECTORS];
-    for row in data.chunks_exact_mut(COLUMNS) {
-        for (k, p) in row.chunks_exact_mut(LANES).enumerate() {
-            last[k] = recursion.next(&mut a[k], f32x8::from_slice(s, p));
-            last[k].store_slice(p);
+    for x in (0..stride).step_by(COLUMNS) {
+        let mut a = [[v(0.0); P]; VECTORS];
+        for k in 0..VECTORS {
+            a[k] = recursion.settled(f32x8::from_slice(s, &data[x + LANES * k..][..LANES]));
+        }
+        let mut last = [v(0.0); VECTORS];
+        for row in data.chunks_exact_mut(stride) {
+            for (k, p) in row[x..x + COLUMNS].chunks_exact_mut(LANES).enumerate() {
+                last[k] = recursion.next(&mut a[k], f32x8::from_slice(s, p));
+                last[k].store_slice(p);
+            }
+        }
+        for k in 0..VECTORS {
+            a[k] = recursion.settled(last[k]);
+        }
+        for row in data.chunks_exact_mut(stride).rev() {
+            for (k, p) in row[x..x + COLUMNS].chunks_exact_mut(LANES).enumerate() {
+                (recursion.next(&mut a[k], f32x8::from_slice(s, p)) * gain).store_slice(p);
+            }
         }
     }
-    for k in 0..VECTORS {
-        a[k] = recursion.settled(last[k]);
-    }
-    for row in data.chunks_exact_mut(COLUMNS).rev() {
-        for (k, p) in row.chunks_exact_mut(LANES).enumerate() {
-            (recursion.next(&mut a[k], f32x8::from_slice(s, p)) * gain).store_slice(p);
-        }
-    }
-    if !difference {
-        return;
-    }
+}
+
+/// Derivative down [`COLUMNS`] columns of coefficients.
+#[simd]
+fn difference<S: Simd, const P: usize>(s: S, data: &mut [f32], spline: &Spline<P>) {
+    let v = |a: f32| f32x8::splat(s, a);
     let slope = spline.slope.map(v);
     for x in (0..COLUMNS).step_by(LANES) {
         let mut w = [v(0.0); MAX_SLOPE];

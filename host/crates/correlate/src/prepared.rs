@@ -29,8 +29,6 @@ pub struct Target {
     /// Subtracted before the coefficients were made, so that single precision is not spent on it.
     pub(crate) offset: f32,
     pub(crate) interpolation: Interpolation,
-    /// Memory for the work.
-    between: Plane,
 }
 
 impl Reference {
@@ -90,13 +88,7 @@ impl Reference {
 impl Target {
     /// Prepares a deformed image for the given interpolation.
     pub fn new(image: Image, interpolation: Interpolation) -> Self {
-        let mut target = Self {
-            offset: 0.0,
-            coefficients: Plane::default(),
-            interpolation,
-            image,
-            between: Plane::default(),
-        };
+        let mut target = Self { offset: 0.0, coefficients: Plane::default(), interpolation, image };
         target.prepare();
         target
     }
@@ -126,8 +118,8 @@ impl Target {
 
     fn prepare(&mut self) {
         self.offset = self.image.mean();
-        let Self { image, offset, between, coefficients, interpolation } = self;
-        plane::coefficients(Level::new(), image, *offset, *interpolation, between, coefficients);
+        let Self { image, offset, coefficients, interpolation } = self;
+        plane::coefficients(Level::new(), image, *offset, *interpolation, coefficients);
     }
 
     /// The image.

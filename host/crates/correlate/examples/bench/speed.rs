@@ -47,8 +47,9 @@ impl Series {
     /// A further pair: both images are new, memory and grid are used again.
     fn warm(&mut self, work: &Work, a: &Grey, b: &Grey) -> Result<Run, String> {
         timed(|| {
-            self.reference.update(image(a)?);
-            self.target.update(image(b)?);
+            let failed = |e: ImageError| e.to_string();
+            self.reference.assign(a.width, a.height, a.width, &a.pixels).map_err(failed)?;
+            self.target.assign(b.width, b.height, b.width, &b.pixels).map_err(failed)?;
             self.correlate(work)
         })
     }
