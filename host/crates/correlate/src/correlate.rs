@@ -8,11 +8,12 @@ use crate::icgn::{Outcome, Solver};
 use crate::point::{Point, ShapeParameters, SolvedBy, Status};
 use crate::points::Points;
 use crate::prepared::{Reference, Target};
-use crate::propagate::Propagation;
+use crate::propagate::{Propagation, SCAN};
 use crate::settings::{Criterion, Interpolation, Settings, SettingsError, SolverChoice};
 use crate::simd::dispatch;
 use crate::start::{Seed, StartReport};
 use fearless_simd::{Level, Simd};
+use rayon::prelude::*;
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
@@ -351,7 +352,12 @@ fn finished(run: Propagation<'_>, start: Instant, init: Duration) -> Result<Corr
         }
     }
     consistency::judge(run.solver, points, &mut outcomes);
-    let points: Vec<Point> = outcomes.iter().enumerate().map(|(k, o)| point(points, k, o.as_ref())).collect();
+    let points: Vec<Point> = outcomes
+        .par_iter()
+        .with_min_len(SCAN)
+        .enumerate()
+        .map(|(k, o)| point(points, k, o.as_ref()))
+        .collect();
     let settings = run.solver.settings;
     report.close(&points, settings.shape, settings.radius());
     Ok(Correlation { points, timing: Timing { init, solve: start.elapsed() - init }, start: report })

@@ -14,6 +14,7 @@ use crate::halves::{Halves, Line};
 use crate::icgn::{Fit, Outcome, Scratch, Solver};
 use crate::point::{SolvedBy, Status};
 use crate::points::Points;
+use crate::propagate::SCAN;
 use crate::shape::Warp;
 use rayon::prelude::*;
 
@@ -69,7 +70,7 @@ pub(crate) fn resolve(
     outcomes: &mut [Option<Outcome>],
     observer: &dyn Observer,
 ) {
-    let deficits: Vec<f32> = outcomes.iter().map(deficit).collect();
+    let deficits: Vec<f32> = outcomes.par_iter().with_min_len(SCAN).map(deficit).collect();
     let Some(suspect) = suspects(solver, points, &deficits, outcomes) else {
         return;
     };
@@ -133,7 +134,8 @@ fn suspects(
         None => suspect.iter_mut().enumerate().for_each(|(k, s)| *s = judge(k, usual)),
         Some(grid) => {
             let away = reach(solver, grid.step);
-            for j in 0..grid.rows {
+            let of_row = |j: usize| {
+                let mut found = Vec::new();
                 for i in 0..grid.columns {
                     let Some(k) = grid.point(i, j) else {
                         continue;
@@ -155,9 +157,14 @@ fn suspects(
                             low[1] = d;
                         }
                     }
-                    suspect[k] = judge(k, low[1].clamp(QUANTISED, DISTURBED * usual));
+                    if judge(k, low[1].clamp(QUANTISED, DISTURBED * usual)) {
+                        found.push(k);
+                    }
                 }
-            }
+                found
+            };
+            let found: Vec<usize> = (0..grid.rows).into_par_iter().flat_map_iter(of_row).collect();
+            found.into_iter().for_each(|k| suspect[k] = true);
         }
     }
     suspect.contains(&true).then_some(suspect)

@@ -39,7 +39,7 @@ impl Plane {
     fn resize(&mut self, image: &Image) {
         self.stride = (image.width() + 2 * PAD).next_multiple_of(COLUMNS);
         self.rows = (image.height() + 2 * PAD).next_multiple_of(COLUMNS);
-        self.data.resize(self.stride * self.rows, 0.0);
+        resize(&mut self.data, self.stride * self.rows);
     }
 
     /// Index of a pixel that may lie outside the padding: such an index is out of range, or that of
@@ -55,6 +55,15 @@ impl Plane {
     #[inline(always)]
     pub(crate) fn index(&self, x: i32, y: i32) -> usize {
         (y + PAD as i32) as usize * self.stride + (x + PAD as i32) as usize
+    }
+}
+
+/// Sets the length; new memory comes zeroed from the system, without being written.
+pub(crate) fn resize(data: &mut Vec<f32>, len: usize) {
+    if data.capacity() < len {
+        *data = vec![0.0; len];
+    } else {
+        data.resize(len, 0.0);
     }
 }
 

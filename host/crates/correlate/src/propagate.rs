@@ -28,6 +28,9 @@ const CLEARLY: f64 = 0.1;
 /// Seeds that are searched before it is asked whether searching pays.
 pub(crate) const BATCH: usize = 64;
 
+/// Points that one thread looks through at a time.
+pub(crate) const SCAN: usize = 2048;
+
 /// State of a run.
 pub(crate) struct Propagation<'a> {
     pub(crate) solver: &'a Solver<'a>,
@@ -262,6 +265,12 @@ impl<'a> Propagation<'a> {
     pub(crate) fn complete(&mut self, proposals: &[(usize, Warp)], guess: &Guess<'_>) {
         self.dense = true;
         self.count();
+        let settled =
+            |o: &Option<Outcome>| o.is_some_and(|o| o.status == Status::Converged && o.zncc >= DOUBTFUL);
+        if self.outcomes.par_iter().with_min_len(SCAN).all(settled) {
+            self.tell();
+            return;
+        }
         let mut tasks: Vec<Task> = proposals.iter().map(|&(point, warp)| Task { point, warp }).collect();
         let proposed: HashSet<usize> = proposals.iter().map(|p| p.0).collect();
         for point in 0..self.points.len() {

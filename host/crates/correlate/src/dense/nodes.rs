@@ -2,6 +2,7 @@
 //! edge as far as subsets reach; bilinear between them.
 
 use super::tiling::Tiling;
+use crate::plane::resize;
 use crate::shape::Warp;
 
 /// A field on the nodes of a grid, `margin` more on every side, and some columns to spare for whole
@@ -56,7 +57,7 @@ impl Nodes {
         self.stride = tiling.columns.next_multiple_of(8) + 2 * e + 32;
         let n = self.stride * (tiling.rows + 2 * e + 1);
         for v in [&mut self.u, &mut self.v, &mut self.cu, &mut self.cv] {
-            v.resize(n, 0.0);
+            resize(v, n);
         }
     }
 

@@ -11,7 +11,7 @@ use super::reference::{self, FIELD_BLOCK, Line, Prepared, corner, lines};
 use super::sums::{Group, SumBuffers, flush};
 use super::tiling::{DEGREES, LANES, Task, Tiling, moments};
 use super::warp::{RowField, Spread, warp_row};
-use crate::plane::Plane;
+use crate::plane::{Plane, resize};
 use crate::prepared::Reference;
 use crate::sampler::V;
 use crate::settings::{Criterion, Interpolation};
@@ -73,7 +73,7 @@ impl Pass<'_> {
         buffers: &mut Buffers,
         out: &mut Vec<f32>,
     ) {
-        out.resize(task.rows * task.width * outputs(self.order), 0.0);
+        resize(out, task.rows * task.width * outputs(self.order));
         macro_rules! go {
             ($n:literal, $n1:literal, $o:literal) => {
                 dispatch!(level, s => run::<_, $n, $n1, $o>(s, self, task, data, buffers, out))

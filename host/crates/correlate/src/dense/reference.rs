@@ -4,6 +4,7 @@
 use super::sums::{Group, SumBuffers, flush};
 use super::tiling::{DEGREES, LANES, Task, Tiling, moments, monomial};
 use crate::normal::EXPONENTS;
+use crate::plane::resize;
 use crate::prepared::Reference;
 use crate::sampler::V;
 use crate::simd::dispatch;
@@ -131,7 +132,7 @@ impl Prepared {
         line: &mut Line,
     ) {
         let block = Layout::new(order).len() * LANES;
-        self.constants.resize(task.rows * task.width / LANES * block, 0.0);
+        resize(&mut self.constants, task.rows * task.width / LANES * block);
         match order {
             0 => dispatch!(level, s => factor::<_, 0, 0>(s, self, tiling, task, reference, buffers, line)),
             1 => dispatch!(level, s => factor::<_, 1, 2>(s, self, tiling, task, reference, buffers, line)),
