@@ -289,10 +289,10 @@ impl Dense {
                     share.settled = share.has_settled(&tiling, order);
                 }
             });
+            observer.points(points.len() * (number + 1) / (PASSES + 1), points.len());
             if observer.cancelled() {
                 return Vec::new();
             }
-            observer.points(points.len() * (number + 1) / (PASSES + 1), points.len());
         }
         self.collect(solver, points, &tiling, order, accept, outcomes)
     }
