@@ -115,7 +115,7 @@ fn uncertainty() -> Fallible<Chart> {
     }
     series.push(Series::new("equal", SeriesStyle::Dashed, vec![(0.0, 0.0), (largest, largest)]));
     Ok(Chart {
-        title: "Stated uncertainty of u against the scatter, noise of 0.5 to 5 grey levels".into(),
+        title: "Stated σ of u against the scatter, noise of 0.5–5 grey levels".into(),
         x_label: "scatter of repeats (10⁻³ px)".into(),
         y_label: "stated σ, RMS (10⁻³ px)".into(),
         series,
