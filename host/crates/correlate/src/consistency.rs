@@ -1,8 +1,9 @@
 //! What neighbours say about a point, and whether a group of points can be chance.
 
-use crate::icgn::{Outcome, Solver, significant};
+use crate::icgn::{Outcome, Solver};
 use crate::point::{SolvedBy, Status};
 use crate::points::Points;
+use crate::verdict::significant;
 
 /// Groups that confirm each other but cover less than this many subsets may be one chance match:
 /// overlapping subsets share their pixels.

@@ -37,6 +37,8 @@ mod simd;
 mod start;
 pub mod strain;
 mod subset;
+mod uncertainty;
+mod verdict;
 mod views;
 
 pub use correlate::{

@@ -6,10 +6,11 @@ use super::reference::Layout;
 use super::tiling::{LANES, Tiling, moments};
 use super::{CARRIES, CURVATURE, Dense, LINEAR, NEGLIGIBLE, NEGLIGIBLE_PX, NOISY, Share};
 use crate::domain::Coverage;
-use crate::icgn::{Accepted, BORDER, Numbers, Outcome, Solver};
+use crate::icgn::{Outcome, Solver};
 use crate::point::{SolvedBy, Status};
 use crate::points::Points;
 use crate::shape::Warp;
+use crate::verdict::{Accepted, BORDER, Numbers};
 use rayon::prelude::*;
 
 impl Dense {

@@ -6,9 +6,10 @@ use super::nodes::Affine;
 use super::pass::{GAIN, ZNCC, outputs};
 use super::reference::Layout;
 use super::tiling::{LANES, Tiling, moments};
-use crate::icgn::{MOST_EXCESS, Solver};
+use crate::icgn::Solver;
 use crate::sampler::V;
 use crate::simd::dispatch;
+use crate::uncertainty::MOST_EXCESS;
 use fearless_simd::{Level, prelude::*};
 use fearless_simd_macros::simd;
 

@@ -199,8 +199,7 @@ impl Dense {
                     &share.task,
                     solver.reference,
                     order,
-                    &mut b.sums,
-                    &mut b.line,
+                    (&mut b.sums, &mut b.line),
                 )
             });
         });

@@ -128,8 +128,7 @@ impl Prepared {
         task: &Task,
         reference: &Reference,
         order: usize,
-        buffers: &mut SumBuffers,
-        line: &mut Line,
+        (buffers, line): (&mut SumBuffers, &mut Line),
     ) {
         let block = Layout::new(order).len() * LANES;
         resize(&mut self.constants, task.rows * task.width / LANES * block);
