@@ -23,6 +23,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         grating_to_reference_mm: 109.0,
         minus: grating,
         plus: grating,
+        reference: Default::default(),
     };
     let model = optics.model()?;
     let points: Vec<_> = (0..100_000)
@@ -94,7 +95,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         tracked.push(TrackedPoint { frames });
     }
     let mut start = optics;
-    for p in Parameter::ALL {
+    for p in daic_optics::calibrate::SUPPORTED {
         let value = 1.01 * p.get(&optics);
         p.set(&mut start, value);
     }

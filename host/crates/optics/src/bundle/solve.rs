@@ -1,0 +1,497 @@
+//! Residuals, their derivatives, and Levenberg–Marquardt's iteration.
+
+use nalgebra::{DMatrix, Matrix2, Vector2};
+
+use super::check::{REFERENCE, moves_known};
+use super::normal::{Block, Normal, Step};
+use super::{Known, Pose, RigCalibration, RigData, RigError, RigSettings};
+use crate::grating::Axes;
+use crate::maps::DistortionMaps;
+use crate::model::{Setup, TraceError};
+use crate::parameter::{OF_ONE_VIEW, Parameter};
+use crate::project::{near, project};
+use crate::real::{Dual, Real, dot};
+use crate::robust::{HUBER, Loss, spread};
+use crate::setup::{Optics, View};
+
+/// Derivatives by the object point, then by the parameters of one view.
+type D = Dual<{ 3 + OF_ONE_VIEW }>;
+/// Derivatives of an object point by the pose's angles and translation, the plate coordinates and
+/// the plate's scale.
+type OfPlate = Dual<9>;
+
+/// Everything that is estimated.
+#[derive(Clone)]
+pub(super) struct State {
+    pub(super) optics: Optics,
+    pub(super) poses: Vec<Pose>,
+    pub(super) plate: Vec<Option<[f64; 2]>>,
+    pub(super) stage: [f64; 3],
+    pub(super) scale: f64,
+}
+
+/// A pixel of one point in one pose.
+pub(super) struct Observation {
+    pub(super) point: usize,
+    pub(super) pose: usize,
+    pub(super) view: View,
+    pub(super) px: [f64; 2],
+    pub(super) sigma_px: [f64; 2],
+}
+
+/// A parameter and its prior: value and standard deviation.
+pub(super) struct Unknown {
+    pub(super) parameter: Parameter,
+    pub(super) prior: Option<Known>,
+}
+
+pub(super) struct Problem<'a> {
+    pub(super) maps: &'a DistortionMaps,
+    pub(super) data: &'a RigData,
+    pub(super) settings: &'a RigSettings,
+    pub(super) unknowns: Vec<Unknown>,
+    /// Ordered by point, pose, view.
+    pub(super) observations: Vec<Observation>,
+    /// First column of each pose; none for the reference.
+    poses_at: Vec<Option<usize>>,
+    stage_at: Option<usize>,
+    scale_at: Option<usize>,
+    columns: usize,
+}
+
+pub(super) fn calibrate(
+    start: &Optics,
+    mut state: State,
+    maps: &DistortionMaps,
+    data: &RigData,
+    settings: &RigSettings,
+) -> Result<RigCalibration, RigError> {
+    let mut problem = Problem::new(start, maps, data, settings);
+    let usable = problem.usable(&state)?;
+    let mut iterations = 0;
+    let mut plate_scale = None;
+    if data.plate_mm.iter().any(Option::is_some) && moves_known(data, settings) {
+        problem.free_scale(true);
+        iterations += problem.minimise(&mut state, &usable, true)?.0;
+        plate_scale = Some(problem.check_scale(&state, &usable)?);
+        problem.free_scale(false);
+        state.scale = 1.0;
+    }
+    let (made, normal) = problem.minimise(&mut state, &usable, true)?;
+    iterations += made;
+    let scale = problem.scales(&state);
+    let parameters: Vec<Parameter> = problem.unknowns.iter().map(|u| u.parameter).collect();
+    normal.weak(&parameters, &scale).map_err(|combination| RigError::Undetermined { combination })?;
+    let mut active = usable.clone();
+    for round in 0..10 {
+        let selected = problem.select(&state, &usable)?;
+        if round > 0 && selected == active {
+            break;
+        }
+        active = selected;
+        iterations += problem.minimise(&mut state, &active, false)?.0;
+    }
+    problem.finish(start, &state, &active, plate_scale, iterations)
+}
+
+impl<'a> Problem<'a> {
+    fn new(start: &Optics, maps: &'a DistortionMaps, data: &'a RigData, settings: &'a RigSettings) -> Self {
+        let mut unknowns: Vec<Unknown> = settings
+            .parameters
+            .iter()
+            .map(|e| Unknown {
+                parameter: e.parameter,
+                prior: e.prior_sigma.map(|sigma| Known { value: e.parameter.get(start), sigma }),
+            })
+            .collect();
+        // Without plate coordinates nothing says where on the plate the origin is.
+        let of_plane = if data.plate_mm.iter().any(Option::is_some) { 6 } else { 3 };
+        unknowns.extend(REFERENCE[..of_plane].iter().map(|p| Unknown { parameter: *p, prior: None }));
+        let mut observations = Vec::new();
+        for (pose, p) in data.poses.iter().enumerate() {
+            for s in &p.sightings {
+                for view in View::BOTH {
+                    if let Some(seen) = s.view(view) {
+                        let (px, sigma_px) = (seen.px, seen.sigma_px);
+                        observations.push(Observation { point: s.point, pose, view, px, sigma_px });
+                    }
+                }
+            }
+        }
+        observations.sort_by_key(|o| (o.point, o.pose, o.view == View::Plus));
+        let mut columns = unknowns.len();
+        let mut take = |n: usize| {
+            columns += n;
+            columns - n
+        };
+        let poses_at =
+            (0..data.poses.len()).map(|k| (k != settings.reference_pose).then(|| take(6))).collect();
+        let stage_at = moves_known(data, settings).then(|| take(3));
+        Self { maps, data, settings, unknowns, observations, poses_at, stage_at, scale_at: None, columns }
+    }
+
+    /// Whether the directions of the stage's axes are estimated.
+    pub(super) fn stage_estimated(&self) -> bool {
+        self.stage_at.is_some()
+    }
+
+    /// Whether the size of the plate is estimated.
+    fn free_scale(&mut self, free: bool) {
+        match (self.scale_at.take(), free) {
+            (None, true) => {
+                self.scale_at = Some(self.columns);
+                self.columns += 1;
+            }
+            (Some(_), false) => self.columns -= 1,
+            (before, _) => self.scale_at = before,
+        }
+    }
+
+    /// Observations of points with coordinates that the starting values can project.
+    fn usable(&self, state: &State) -> Result<Vec<bool>, RigError> {
+        let plain = Setup::<f64>::new(&state.optics, self.maps);
+        let newton = Setup::new(&state.optics, self.maps);
+        let usable: Vec<bool> = self
+            .observations
+            .iter()
+            .map(|o| self.predict(state, &plain, &newton, o).is_some_and(|p| p.is_ok()))
+            .collect();
+        let lost = usable.iter().filter(|u| !**u).count();
+        self.check_outliers(lost)?;
+        Ok(usable)
+    }
+
+    fn check_outliers(&self, rejected: usize) -> Result<(), RigError> {
+        let observations = self.observations.len();
+        let limit = (self.settings.max_outlier_fraction * observations as f64) as usize;
+        if rejected > limit {
+            return Err(RigError::TooManyOutliers { rejected, observations, limit });
+        }
+        Ok(())
+    }
+
+    /// The pixel that the state predicts, if the point has coordinates.
+    fn predict(
+        &self,
+        state: &State,
+        plain: &Setup<f64>,
+        newton: &Setup<Dual<2>>,
+        o: &Observation,
+    ) -> Option<Result<[f64; 2], TraceError>> {
+        let [x, y] = state.plate[o.point]?;
+        let size = self.size_of(o.point, state);
+        let p = state.poses[o.pose].point_mm([x * size, y * size]);
+        Some(project(plain, newton, o.view, p.into(), near(&state.optics, o.px)))
+    }
+
+    /// The scale applies to coordinates that were stated.
+    fn size_of(&self, point: usize, state: &State) -> f64 {
+        if self.data.plate_mm[point].is_some() { state.scale } else { 1.0 }
+    }
+
+    /// Residuals (observed − predicted, px) of the observations in use; zero for others.
+    pub(super) fn residuals(&self, state: &State, active: &[bool]) -> Result<Vec<[f64; 2]>, TraceError> {
+        let plain = Setup::<f64>::new(&state.optics, self.maps);
+        let newton = Setup::new(&state.optics, self.maps);
+        let mut all = vec![[0.0; 2]; active.len()];
+        for ((o, r), _) in self.observations.iter().zip(&mut all).zip(active).filter(|(_, a)| **a) {
+            if let Some(p) = self.predict(state, &plain, &newton, o) {
+                let p = p?;
+                *r = [o.px[0] - p[0], o.px[1] - p[1]];
+            }
+        }
+        Ok(all)
+    }
+
+    /// Residuals divided by their standard deviations, of the observations in use.
+    pub(super) fn normalised(&self, residuals: &[[f64; 2]], active: &[bool]) -> Vec<f64> {
+        let used = self.observations.iter().zip(residuals).zip(active).filter(|(_, a)| **a);
+        used.flat_map(|((o, r), _)| [r[0] / o.sigma_px[0], r[1] / o.sigma_px[1]]).collect()
+    }
+
+    pub(super) fn poses_in_use(&self, active: &[bool]) -> Vec<bool> {
+        let mut used = vec![false; self.data.poses.len()];
+        for (o, _) in self.observations.iter().zip(active).filter(|(_, a)| **a) {
+            used[o.pose] = true;
+        }
+        used
+    }
+
+    /// Residuals of what is known beforehand: derivatives and value, each divided by its standard
+    /// deviation; the parameters' own come first and are marked.
+    pub(super) fn known(&self, state: &State, used: &[bool]) -> Vec<(Vec<(usize, f64)>, f64, bool)> {
+        let mut all = Vec::new();
+        for (j, u) in self.unknowns.iter().enumerate() {
+            if let Some(Known { value, sigma }) = u.prior {
+                all.push((vec![(j, 1.0 / sigma)], (value - u.parameter.get(&state.optics)) / sigma, true));
+            }
+        }
+        if let Some(at) = self.stage_at {
+            let sigma = self.settings.stage_axes_sigma_rad;
+            for (i, angle) in state.stage.into_iter().enumerate() {
+                all.push((vec![(at + i, 1.0 / sigma)], -angle / sigma, false));
+            }
+        }
+        let v = |i: usize, value: f64| Dual::<6>::variable(value, i);
+        let axes = Axes::new([0, 1, 2].map(|i| v(3 + i, state.stage[i])));
+        for (k, pose) in self.data.poses.iter().enumerate() {
+            let Some(at) = self.poses_at[k].filter(|_| used[k]) else { continue };
+            for (i, known) in pose.known.rotation_rad.iter().enumerate() {
+                if let Some(Known { value, sigma }) = known {
+                    let r = (value - state.poses[k].rotation_rad[i]) / sigma;
+                    all.push((vec![(at + i, 1.0 / sigma)], r, false));
+                }
+            }
+            let t = [0, 1, 2].map(|i| v(i, state.poses[k].translation_mm[i]));
+            let along = [dot(axes.across, t), dot(axes.along, t), dot(axes.normal, t)];
+            for (known, along) in pose.known.translation_mm.iter().zip(along) {
+                if let Some(Known { value, sigma }) = known {
+                    let mut row: Vec<_> = (0..3).map(|i| (at + 3 + i, along.gradient[i] / sigma)).collect();
+                    if let Some(stage) = self.stage_at {
+                        row.extend((0..3).map(|i| (stage + i, along.gradient[3 + i] / sigma)));
+                    }
+                    all.push((row, (value - along.value) / sigma, false));
+                }
+            }
+        }
+        all
+    }
+
+    /// Normal equations at `state`.
+    pub(super) fn linearise(&self, state: &State, active: &[bool], loss: Loss) -> Result<Normal, TraceError> {
+        let place = |p| self.unknowns.iter().position(|u| u.parameter == p);
+        let setups = View::BOTH.map(|view| {
+            Setup::<D>::with(&state.optics, self.maps, |p, value| match (place(p), p.index_in(view)) {
+                (Some(_), Some(slot)) => Dual::variable(value, 3 + slot),
+                _ => Dual::constant(value),
+            })
+        });
+        let newton = Setup::new(&state.optics, self.maps);
+        let slots = View::BOTH.map(|view| -> Vec<(usize, usize)> {
+            let unknowns = self.unknowns.iter().enumerate();
+            unknowns.filter_map(|(j, u)| Some((j, 3 + u.parameter.index_in(view)?))).collect()
+        });
+        let axes: Vec<Axes<OfPlate>> = state
+            .poses
+            .iter()
+            .map(|p| Axes::new([0, 1, 2].map(|i| OfPlate::variable(p.rotation_rad[i], i))))
+            .collect();
+
+        let mut normal = Normal::new(self.columns);
+        let mut row: Vec<(usize, f64)> = Vec::new();
+        for (group, active) in self.by_point(active) {
+            let point = group[0].point;
+            let Some(xy) = state.plate[point] else { continue };
+            let stated = self.data.plate_mm[point].is_some();
+            let mut block = Block { point, c: Matrix2::zeros(), rhs: Vector2::zeros(), by: Vec::new() };
+            let mut by = vec![Vector2::zeros(); if stated { 0 } else { self.columns }];
+            for (o, _) in group.iter().zip(active).filter(|(_, a)| **a) {
+                let size = OfPlate::variable(self.size_of(point, state), 8);
+                let (x, y) = (OfPlate::variable(xy[0], 6) * size, OfPlate::variable(xy[1], 7) * size);
+                let t = state.poses[o.pose].translation_mm;
+                let at = [0, 1, 2].map(|i| {
+                    let a = &axes[o.pose];
+                    a.across[i] * x + a.along[i] * y + OfPlate::variable(t[i], 3 + i)
+                });
+                let p = [0, 1, 2].map(|i| D::variable(at[i].value, i));
+                let pixel = project(&setups[o.view.index()], &newton, o.view, p, near(&state.optics, o.px))?;
+                for c in 0..2 {
+                    let sigma = o.sigma_px[c];
+                    let g = &pixel[c].gradient;
+                    let r = (o.px[c] - pixel[c].value) / sigma;
+                    let w = loss.weight(r);
+                    let of_plate = |i: usize| (0..3).map(|k| g[k] * at[k].gradient[i]).sum::<f64>() / sigma;
+                    row.clear();
+                    row.extend(slots[o.view.index()].iter().map(|(j, slot)| (*j, g[*slot] / sigma)));
+                    if let Some(first) = self.poses_at[o.pose] {
+                        row.extend((0..6).map(|i| (first + i, of_plate(i))));
+                    }
+                    if let Some(scale) = self.scale_at.filter(|_| stated) {
+                        row.push((scale, of_plate(8)));
+                    }
+                    normal.add(&row, r, w);
+                    if !stated {
+                        let own = Vector2::new(of_plate(6), of_plate(7));
+                        block.c += own * own.transpose() * w;
+                        block.rhs += own * (w * r);
+                        for (j, g) in &row {
+                            by[*j] += own * (w * g);
+                        }
+                    }
+                }
+            }
+            if !stated && block.c != Matrix2::zeros() {
+                let touched = by.into_iter().enumerate().filter(|(_, b)| *b != Vector2::zeros());
+                block.by = touched.collect();
+                normal.blocks.push(block);
+            }
+        }
+        let used = self.poses_in_use(active);
+        for (row, r, prior) in self.known(state, &used) {
+            if let ([(j, g)], true) = (row.as_slice(), prior) {
+                normal.prior[*j] += g * g;
+                normal.rhs[*j] += g * r;
+            } else {
+                normal.add(&row, r, 1.0);
+            }
+        }
+        // A pose without data stays where it is.
+        for at in self.poses_at.iter().zip(&used).filter_map(|(at, used)| at.filter(|_| !used)) {
+            for i in 0..6 {
+                normal.a[(at + i, at + i)] += 1.0;
+            }
+        }
+        Ok(normal)
+    }
+
+    /// Observations of each point, and which of them are in use.
+    fn by_point<'b>(&'b self, active: &'b [bool]) -> impl Iterator<Item = (&'b [Observation], &'b [bool])> {
+        let mut at = 0;
+        self.observations.chunk_by(|a, b| a.point == b.point).map(move |group| {
+            let from = at;
+            at += group.len();
+            (group, &active[from..at])
+        })
+    }
+
+    fn moved(&self, state: &State, step: &Step) -> State {
+        let mut next = state.clone();
+        let by = &step.columns;
+        for (j, u) in self.unknowns.iter().enumerate() {
+            u.parameter.set(&mut next.optics, u.parameter.get(&state.optics) + by[j]);
+        }
+        for (pose, at) in next.poses.iter_mut().zip(&self.poses_at) {
+            if let Some(at) = at {
+                for i in 0..3 {
+                    pose.rotation_rad[i] += by[at + i];
+                    pose.translation_mm[i] += by[at + 3 + i];
+                }
+            }
+        }
+        if let Some(at) = self.stage_at {
+            (0..3).for_each(|i| next.stage[i] += by[at + i]);
+        }
+        if let Some(at) = self.scale_at {
+            next.scale += by[at];
+        }
+        for (point, by) in &step.points {
+            if let Some([x, y]) = &mut next.plate[*point] {
+                *x += by.x;
+                *y += by.y;
+            }
+        }
+        next
+    }
+
+    /// Fits the state to the observations in use. Returns the linearisations made and the last.
+    pub(super) fn minimise(
+        &self,
+        state: &mut State,
+        active: &[bool],
+        robust: bool,
+    ) -> Result<(usize, Normal), RigError> {
+        let failed = |iterations| RigError::NotConverged { iterations };
+        let used = self.poses_in_use(active);
+        let prior_cost = |s: &State| self.known(s, &used).iter().map(|(_, r, _)| r * r).sum::<f64>();
+        // Damping relative to the diagonal, of which elimination leaves little: it starts far below.
+        let mut damping = 1e-9;
+        let mut residuals = self.residuals(state, active).map_err(|_| failed(0))?;
+        for iteration in 1..=self.settings.max_iterations {
+            let normalised = self.normalised(&residuals, active);
+            let loss =
+                if robust { Loss::Huber(HUBER * spread(normalised.iter().copied())) } else { Loss::Squares };
+            let cost = normalised.iter().map(|r| loss.of(*r)).sum::<f64>() + prior_cost(state);
+            let normal = self.linearise(state, active, loss).map_err(|_| failed(iteration))?;
+            let sigma = self.covariance(&normal, state)?.diagonal().map(f64::sqrt);
+            loop {
+                let trial = normal.step(damping).and_then(|step| {
+                    let next = self.moved(state, &step);
+                    next.optics.validate().ok()?;
+                    let residuals = self.residuals(&next, active).ok()?;
+                    let normalised = self.normalised(&residuals, active);
+                    let after = normalised.iter().map(|r| loss.of(*r)).sum::<f64>() + prior_cost(&next);
+                    Some((step, next, residuals, after))
+                });
+                if let Some((step, next, new_residuals, after)) = trial {
+                    // At the minimum rounding alone decides whether the cost still falls.
+                    let rounding = 1e-12 * cost + 1e-16 * normalised.len() as f64;
+                    // In standard deviations. A robust fit is only the start of another.
+                    let tolerance = if robust { 1e-2 } else { 1e-4 };
+                    // A heavily damped step is small anywhere.
+                    let small = damping < 1e-7
+                        && step.columns.iter().zip(sigma.iter()).all(|(by, s)| by.abs() <= tolerance * s);
+                    if after <= cost + rounding || small {
+                        *state = next;
+                        residuals = new_residuals;
+                        damping *= 0.01;
+                        if small {
+                            return Ok((iteration, normal));
+                        }
+                        break;
+                    }
+                }
+                damping *= 100.0;
+                if !(damping < 1e6) {
+                    return Err(failed(iteration));
+                }
+            }
+        }
+        Err(failed(self.settings.max_iterations))
+    }
+
+    /// Covariance of all columns, or what is not determined.
+    pub(super) fn covariance(&self, normal: &Normal, state: &State) -> Result<DMatrix<f64>, RigError> {
+        normal.covariance().ok_or_else(|| {
+            let parameters: Vec<Parameter> = self.unknowns.iter().map(|u| u.parameter).collect();
+            let found = normal.weak(&parameters, &self.scales(state));
+            let combination = match found {
+                Err(combination) => combination,
+                Ok(weak) => weak.into_iter().next().map_or_else(Vec::new, |w| w.components),
+            };
+            RigError::Undetermined { combination }
+        })
+    }
+
+    /// Unit of each parameter: its prior's standard deviation, or a usual one.
+    pub(super) fn scales(&self, state: &State) -> Vec<f64> {
+        let of = |u: &Unknown| match (u.prior, u.parameter.unit()) {
+            (Some(prior), _) => prior.sigma,
+            (None, "rad") => 0.1,
+            (None, "px") => 50.0,
+            (None, "mm") => (0.01 * u.parameter.get(&state.optics).abs()).max(1e-6),
+            (None, _) => 1.0,
+        };
+        self.unknowns.iter().map(of).collect()
+    }
+
+    /// Observations that agree with the state.
+    fn select(&self, state: &State, usable: &[bool]) -> Result<Vec<bool>, RigError> {
+        let residuals =
+            self.residuals(state, usable).map_err(|_| RigError::NotConverged { iterations: 0 })?;
+        let limit = self.settings.outlier_limit * spread(self.normalised(&residuals, usable));
+        let selected: Vec<bool> = self
+            .observations
+            .iter()
+            .zip(&residuals)
+            .zip(usable)
+            .map(|((o, r), u)| *u && (0..2).all(|c| r[c].abs() <= limit * o.sigma_px[c]))
+            .collect();
+        self.check_outliers(selected.iter().filter(|s| !**s).count())?;
+        Ok(selected)
+    }
+
+    /// The plate's size by the moves; an error where it contradicts what was stated.
+    fn check_scale(&self, state: &State, active: &[bool]) -> Result<Known, RigError> {
+        /// Difference that no lens or target is made to.
+        const TOLERATED: f64 = 5e-4;
+        let failed = |_| RigError::NotConverged { iterations: 0 };
+        let normal = self.linearise(state, active, Loss::Squares).map_err(failed)?;
+        let covariance = self.covariance(&normal, state)?;
+        let sigma = self.scale_at.map_or(0.0, |at| covariance[(at, at)].sqrt());
+        let ratio = state.scale;
+        if (ratio - 1.0).abs() > TOLERATED.max(5.0 * sigma) {
+            return Err(RigError::PitchConflict { ratio, sigma });
+        }
+        Ok(Known { value: ratio, sigma })
+    }
+}
