@@ -23,6 +23,8 @@ pub(super) struct Normal {
     /// Information of the parameters' priors, for the diagonal.
     pub(super) prior: DVector<f64>,
     pub(super) rhs: DVector<f64>,
+    /// Scale of each column; damping acts on steps in these units.
+    pub(super) unit: DVector<f64>,
     pub(super) blocks: Vec<Block>,
 }
 
@@ -70,6 +72,7 @@ impl Normal {
             a: DMatrix::zeros(columns, columns),
             prior: DVector::zeros(columns),
             rhs: DVector::zeros(columns),
+            unit: DVector::from_element(columns, 0.1),
             blocks: Vec::new(),
         }
     }
@@ -107,7 +110,7 @@ impl Normal {
     fn whole(&self, damping: f64) -> Option<(DMatrix<f64>, DVector<f64>)> {
         let (mut schur, rhs) = self.eliminated(damping)?;
         for i in 0..self.rhs.len() {
-            schur[(i, i)] += self.prior[i] + damping * (self.a[(i, i)] + self.prior[i]);
+            schur[(i, i)] += self.prior[i] + damping / (self.unit[i] * self.unit[i]);
         }
         Some((schur, rhs))
     }
@@ -205,7 +208,7 @@ impl Block {
     fn inverse(&self, damping: f64) -> Option<Matrix2<f64>> {
         let mut c = self.c;
         for i in 0..2 {
-            c[(i, i)] *= 1.0 + damping;
+            c[(i, i)] += damping;
         }
         c.try_inverse()
     }

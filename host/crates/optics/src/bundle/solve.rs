@@ -8,7 +8,7 @@ use super::{Known, Pose, RigCalibration, RigData, RigError, RigSettings};
 use crate::grating::Axes;
 use crate::maps::DistortionMaps;
 use crate::model::{Setup, TraceError};
-use crate::parameter::{OF_ONE_VIEW, Parameter};
+use crate::parameter::{GratingParameter, OF_ONE_VIEW, Parameter};
 use crate::project::{near, project};
 use crate::real::{Dual, Real, dot};
 use crate::robust::{HUBER, Loss, spread};
@@ -19,6 +19,10 @@ type D = Dual<{ 3 + OF_ONE_VIEW }>;
 /// Derivatives of an object point by the pose's angles and translation, the plate coordinates and
 /// the plate's scale.
 type OfPlate = Dual<9>;
+
+/// Usual uncertainty of an angle or of a length of a rig before it is calibrated.
+const ANGLE_RAD: f64 = 0.1;
+const LENGTH_MM: f64 = 5.0;
 
 /// Everything that is estimated.
 #[derive(Clone)]
@@ -278,6 +282,12 @@ impl<'a> Problem<'a> {
             .collect();
 
         let mut normal = Normal::new(self.columns);
+        for (unit, scale) in normal.unit.iter_mut().zip(self.scales(state)) {
+            *unit = scale;
+        }
+        for at in self.poses_at.iter().flatten() {
+            normal.unit.rows_mut(at + 3, 3).fill(LENGTH_MM);
+        }
         let mut row: Vec<(usize, f64)> = Vec::new();
         for (group, active) in self.by_point(active) {
             let point = group[0].point;
@@ -393,8 +403,10 @@ impl<'a> Problem<'a> {
         let failed = |iterations| RigError::NotConverged { iterations };
         let used = self.poses_in_use(active);
         let prior_cost = |s: &State| self.known(s, &used).iter().map(|(_, r, _)| r * r).sum::<f64>();
-        // Damping relative to the diagonal, of which elimination leaves little: it starts far below.
-        let mut damping = 1e-9;
+        // In units of the unknowns' own scales and of the χ² per residual: far from the minimum,
+        // where the model's curvature and not the noise makes the residuals, no step may carry a
+        // weak combination much farther than its prior.
+        let mut damping = if robust { 1e-2 } else { 1e-5 };
         let mut residuals = self.residuals(state, active).map_err(|_| failed(0))?;
         for iteration in 1..=self.settings.max_iterations {
             let normalised = self.normalised(&residuals, active);
@@ -402,9 +414,10 @@ impl<'a> Problem<'a> {
                 if robust { Loss::Huber(HUBER * spread(normalised.iter().copied())) } else { Loss::Squares };
             let cost = normalised.iter().map(|r| loss.of(*r)).sum::<f64>() + prior_cost(state);
             let normal = self.linearise(state, active, loss).map_err(|_| failed(iteration))?;
+            let excess = (cost / normalised.len().max(1) as f64).max(1.0);
             let sigma = self.covariance(&normal, state)?.diagonal().map(f64::sqrt);
             loop {
-                let trial = normal.step(damping).and_then(|step| {
+                let trial = normal.step(damping * excess).and_then(|step| {
                     let next = self.moved(state, &step);
                     next.optics.validate().ok()?;
                     let residuals = self.residuals(&next, active).ok()?;
@@ -416,22 +429,22 @@ impl<'a> Problem<'a> {
                     // At the minimum rounding alone decides whether the cost still falls.
                     let rounding = 1e-12 * cost + 1e-16 * normalised.len() as f64;
                     // In standard deviations. A robust fit is only the start of another.
-                    let tolerance = if robust { 1e-2 } else { 1e-4 };
+                    let tolerance = if robust { 1e-2 } else { 1e-3 };
                     // A heavily damped step is small anywhere.
-                    let small = damping < 1e-7
+                    let small = damping < 2e-3
                         && step.columns.iter().zip(sigma.iter()).all(|(by, s)| by.abs() <= tolerance * s);
                     if after <= cost + rounding || small {
                         *state = next;
                         residuals = new_residuals;
-                        damping *= 0.01;
+                        damping *= 0.1;
                         if small {
                             return Ok((iteration, normal));
                         }
                         break;
                     }
                 }
-                damping *= 100.0;
-                if !(damping < 1e6) {
+                damping *= 10.0;
+                if !(damping < 1e12) {
                     return Err(failed(iteration));
                 }
             }
@@ -456,9 +469,14 @@ impl<'a> Problem<'a> {
     pub(super) fn scales(&self, state: &State) -> Vec<f64> {
         let of = |u: &Unknown| match (u.prior, u.parameter.unit()) {
             (Some(prior), _) => prior.sigma,
-            (None, "rad") => 0.1,
+            (None, "rad") => ANGLE_RAD,
             (None, "px") => 50.0,
-            (None, "mm") => (0.01 * u.parameter.get(&state.optics).abs()).max(1e-6),
+            (None, "mm") => match u.parameter {
+                Parameter::Wavelength | Parameter::Grating(_, GratingParameter::Pitch) => {
+                    1e-3 * u.parameter.get(&state.optics)
+                }
+                _ => LENGTH_MM,
+            },
             (None, _) => 1.0,
         };
         self.unknowns.iter().map(of).collect()
