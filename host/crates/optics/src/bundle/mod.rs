@@ -181,7 +181,7 @@ impl RigSettings {
             stage_axes_sigma_rad: 0.02,
             outlier_limit: 5.0,
             max_outlier_fraction: 0.2,
-            max_iterations: 40,
+            max_iterations: 60,
             leave_one_out: true,
         }
     }

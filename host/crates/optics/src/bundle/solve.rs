@@ -34,6 +34,14 @@ pub(super) struct State {
     pub(super) scale: f64,
 }
 
+/// Where a step leads.
+struct Trial {
+    step: Step,
+    state: State,
+    residuals: Vec<[f64; 2]>,
+    cost: f64,
+}
+
 /// A pixel of one point in one pose.
 pub(super) struct Observation {
     pub(super) point: usize,
@@ -401,55 +409,81 @@ impl<'a> Problem<'a> {
         robust: bool,
     ) -> Result<(usize, Normal), RigError> {
         let failed = |iterations| RigError::NotConverged { iterations };
-        let used = self.poses_in_use(active);
-        let prior_cost = |s: &State| self.known(s, &used).iter().map(|(_, r, _)| r * r).sum::<f64>();
         // In units of the unknowns' own scales and of the χ² per residual: far from the minimum,
         // where the model's curvature and not the noise makes the residuals, no step may carry a
         // weak combination much farther than its prior.
         let mut damping = if robust { 1e-2 } else { 1e-5 };
         let mut residuals = self.residuals(state, active).map_err(|_| failed(0))?;
-        for iteration in 1..=self.settings.max_iterations {
+        let mut iteration = 0;
+        while iteration < self.settings.max_iterations {
+            iteration += 1;
             let normalised = self.normalised(&residuals, active);
             let loss =
                 if robust { Loss::Huber(HUBER * spread(normalised.iter().copied())) } else { Loss::Squares };
-            let cost = normalised.iter().map(|r| loss.of(*r)).sum::<f64>() + prior_cost(state);
+            let cost = self.cost(state, &residuals, active, loss);
             let normal = self.linearise(state, active, loss).map_err(|_| failed(iteration))?;
-            let excess = (cost / normalised.len().max(1) as f64).max(1.0);
             let sigma = self.covariance(&normal, state)?.diagonal().map(f64::sqrt);
+            // At the minimum rounding alone decides whether the cost still falls.
+            let limit = cost * (1.0 + 1e-12) + 1e-16 * normalised.len() as f64;
+            // In standard deviations. A robust fit is only the start of another.
+            let tolerance = if robust { 1e-2 } else { 1e-3 };
             loop {
-                let trial = normal.step(damping * excess).and_then(|step| {
-                    let next = self.moved(state, &step);
-                    next.optics.validate().ok()?;
-                    let residuals = self.residuals(&next, active).ok()?;
-                    let normalised = self.normalised(&residuals, active);
-                    let after = normalised.iter().map(|r| loss.of(*r)).sum::<f64>() + prior_cost(&next);
-                    Some((step, next, residuals, after))
-                });
-                if let Some((step, next, new_residuals, after)) = trial {
-                    // At the minimum rounding alone decides whether the cost still falls.
-                    let rounding = 1e-12 * cost + 1e-16 * normalised.len() as f64;
-                    // In standard deviations. A robust fit is only the start of another.
-                    let tolerance = if robust { 1e-2 } else { 1e-3 };
-                    // A heavily damped step is small anywhere.
-                    let small = damping < 2e-3
-                        && step.columns.iter().zip(sigma.iter()).all(|(by, s)| by.abs() <= tolerance * s);
-                    if after <= cost + rounding || small {
-                        *state = next;
-                        residuals = new_residuals;
-                        damping *= 0.1;
-                        if small {
-                            return Ok((iteration, normal));
-                        }
-                        break;
+                let from = (state as &State, &normal, cost);
+                let mut trial = self.trial(from, damping, active, loss);
+                // A heavily damped step is small anywhere.
+                let small = damping < 2e-3
+                    && trial.as_ref().is_some_and(|t| {
+                        t.step.columns.iter().zip(sigma.iter()).all(|(by, s)| by.abs() <= tolerance * s)
+                    });
+                if let Some(high) = trial.take_if(|t| t.cost > limit && !small) {
+                    // A step along a narrow, bent valley climbs its side; the next leads back to
+                    // the bottom. Only the two together must go down.
+                    iteration += 1;
+                    trial = self.linearise(&high.state, active, loss).ok().and_then(|normal| {
+                        self.trial((&high.state, &normal, high.cost), damping, active, loss)
+                            .filter(|t| t.cost <= limit)
+                    });
+                }
+                if let Some(next) = trial {
+                    *state = next.state;
+                    residuals = next.residuals;
+                    damping *= 0.1;
+                    if small {
+                        return Ok((iteration, normal));
                     }
+                    break;
                 }
                 damping *= 10.0;
-                if !(damping < 1e12) {
+                if !(damping < 1e12) || iteration >= self.settings.max_iterations {
                     return Err(failed(iteration));
                 }
             }
         }
-        Err(failed(self.settings.max_iterations))
+        Err(failed(iteration))
+    }
+
+    fn cost(&self, state: &State, residuals: &[[f64; 2]], active: &[bool], loss: Loss) -> f64 {
+        let used = self.poses_in_use(active);
+        let known = self.known(state, &used).iter().map(|(_, r, _)| r * r).sum::<f64>();
+        self.normalised(residuals, active).iter().map(|r| loss.of(*r)).sum::<f64>() + known
+    }
+
+    /// Where a step from a state with these normal equations and cost leads, if anywhere.
+    fn trial(
+        &self,
+        (state, normal, cost): (&State, &Normal, f64),
+        damping: f64,
+        active: &[bool],
+        loss: Loss,
+    ) -> Option<Trial> {
+        let residuals = 2 * active.iter().filter(|a| **a).count();
+        let excess = (cost / residuals.max(1) as f64).max(1.0);
+        let step = normal.step(damping * excess)?;
+        let next = self.moved(state, &step);
+        next.optics.validate().ok()?;
+        let residuals = self.residuals(&next, active).ok()?;
+        let cost = self.cost(&next, &residuals, active, loss);
+        Some(Trial { step, state: next, residuals, cost })
     }
 
     /// Covariance of all columns, or what is not determined.
