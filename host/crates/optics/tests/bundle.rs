@@ -418,8 +418,8 @@ fn what_cannot_be_calibrated_is_said() {
     let mut d = good.clone();
     let mut random = Normal::new(12);
     for s in d.poses.iter_mut().flat_map(|p| &mut p.sightings) {
-        if random.uniform() < 0.6 {
-            s.plus.iter_mut().for_each(|s| s.px[1] += 30.0 * random.uniform());
+        if random.uniform() < 0.46 {
+            s.plus.iter_mut().for_each(|s| s.px[1] += 5.0 * random.uniform());
         }
     }
     assert!(matches!(fails(&d, same), RigError::TooManyOutliers { .. }));
