@@ -3,8 +3,8 @@
 use std::time::Instant;
 
 use daic_optics::{
-    Brown, Camera, Decoder, Grating, Observation, Optics, Parameter, PixelPair, Settings, Substrate,
-    SubstrateSide, TrackedPoint, View, calibrate,
+    Brown, Camera, Decoder, Grating, Observation, Optics, PixelPair, Settings, Substrate, SubstrateSide,
+    TrackedPoint, View, calibrate,
 };
 use nalgebra::Vector3;
 

@@ -277,8 +277,8 @@ impl DistortionMap {
             let w = 1.0 / (s.sigma_px * s.sigma_px);
             for (a, va) in row {
                 seen[a] = true;
-                for c in 0..2 {
-                    rhs[c][a] += w * va * s.e_px[c];
+                for (rhs, e) in rhs.iter_mut().zip(s.e_px) {
+                    rhs[a] += w * va * e;
                 }
                 for (b, vb) in row.into_iter().filter(|(b, _)| *b <= a) {
                     normal.add(a, b, w * va * vb);

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use super::geometry::lay_all;
-use super::solve::{Problem, State};
+use super::problem::{Problem, State};
 use super::{Known, LeftOut, RigCalibration, RigError, RigEstimate, ViewResiduals, Volume};
 use crate::decode::{Decoder, PixelPair, pixel_covariance};
 use crate::model::OpticalModel;

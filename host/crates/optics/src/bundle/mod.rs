@@ -31,6 +31,7 @@ mod error;
 mod finish;
 mod geometry;
 mod normal;
+mod problem;
 mod solve;
 mod start;
 

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use super::geometry::{FEWEST, lay, plane};
-use super::solve::State;
+use super::problem::State;
 use super::{PlatePose, Pose, RigData, RigError, RigSettings};
 use crate::decode::{Decoder, PixelPair};
 use crate::maps::DistortionMaps;
