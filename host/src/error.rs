@@ -22,6 +22,31 @@ pub enum Error {
     /// Optics that no set-up can have.
     #[error("the optics cannot be used: {0}")]
     Optics(#[from] daic_optics::OpticsError),
+    /// A covariance in an optics file that is none.
+    #[error("{}: covariance: {reason}", path.display())]
+    OpticsCovariance {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, with the parameter's name.
+        reason: String,
+    },
+    /// The rig could not be calibrated.
+    #[error("no calibration of the rig: {0}")]
+    CalibrateRig(#[from] daic_optics::RigError),
+    /// A row of a table of tracked points or moves that cannot be used.
+    #[error("{}, row {row}: {column} is {value}, it must be {allowed}", path.display())]
+    TrackedPoint {
+        /// The table.
+        path: PathBuf,
+        /// Row from 1, without the header.
+        row: usize,
+        /// Its column.
+        column: &'static str,
+        /// The value found.
+        value: f64,
+        /// What is allowed.
+        allowed: &'static str,
+    },
     /// Neither one grating nor one for each view.
     #[error(
         "the optics state no complete grating: give `grating`, or both `grating_minus` and `grating_plus`"

@@ -11,9 +11,11 @@
 //! * [`pair`]: plain 2D-DIC of two images; [`strain`] and [`probe`] work on its results, [`noise_floor`]
 //!   says what such a measurement can resolve.
 //! * [`phase`]: phases of gratings and displacements from them.
+//! * [`calibrate_rig`]: points tracked on a plate become an optics file.
 //! * [`sequence`]: the same of a series of images.
 
 pub mod area;
+pub mod calibrate_rig;
 #[cfg(feature = "sim")]
 pub mod demo;
 pub mod doctor;

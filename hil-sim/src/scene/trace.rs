@@ -3,7 +3,7 @@
 //! Written apart from the decoders on purpose: of `daic-optics` it uses the grating equation and
 //! nothing else, so that an error in one of the two is not cancelled by the same error in the other.
 
-use daic_optics::grating::{Grating, GratingFrame, Substrate};
+use daic_optics::grating::{Grating, GratingFrame};
 use nalgebra::Vector3;
 
 use crate::config::{GratingConfig, OpticsConfig};
@@ -53,8 +53,7 @@ impl Plate {
         let (sz, cz) = az.sin_cos();
         let turned = [sy * cx, -sx, cy * cx];
         let normal = [cz * turned[0] - sz * turned[1], sz * turned[0] + cz * turned[1], turned[2]];
-        let grating =
-            Grating { pitch_mm: config.pitch_mm, tilt_rad_xyz: config.tilt_rad, substrate: Substrate::NONE };
+        let grating = Grating { tilt_rad_xyz: config.tilt_rad, ..Grating::square(config.pitch_mm) };
         Self { frame: grating.frame(), normal, thickness: config.substrate_mm, index: config.substrate_index }
     }
 }

@@ -1,5 +1,6 @@
 //! Commands and their flags.
 
+use super::calibrate::CalibrateArgs;
 use super::strain::{NoiseFloorArgs, ProbeArgs, StrainArgs};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
@@ -41,6 +42,8 @@ pub enum Command {
     Probe(ProbeArgs),
     /// Noise of displacement and strain, from frames of a specimen that does not move
     NoiseFloor(NoiseFloorArgs),
+    /// Calibrate the optics
+    Calibrate(CalibrateArgs),
     /// Phases of a line or cross grating; with a second image, the displacement between both
     Phase(PhaseArgs),
     /// Height map of one frame with both first-order views

@@ -1,6 +1,7 @@
 //! Flags, progress and the shape of answers.
 
 mod arguments;
+mod calibrate;
 mod commands;
 mod output;
 mod strain;
@@ -52,6 +53,7 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Strain(arguments) => strain::strain(arguments, output),
         Command::Probe(arguments) => strain::probe(arguments),
         Command::NoiseFloor(arguments) => strain::noise_floor(arguments, output),
+        Command::Calibrate(arguments) => calibrate::calibrate(arguments),
         Command::Phase(arguments) => commands::phase(arguments, output),
         Command::Profile(arguments) => commands::profile(arguments, output),
         Command::Displacement(arguments) => commands::displacement(arguments, output),

@@ -164,7 +164,7 @@ fn datum_sigma(found: &daic_optics::calibrate::Calibration, model: &OpticalModel
     let Ok(jacobian) = model.parameter_jacobian(Decoder::Ray, PixelPair { minus_px, plus_px }) else {
         return f64::NAN;
     };
-    let by = [jacobian[(2, 0)], jacobian[(2, 1)]];
+    let by = [Parameter::FocalPx, Parameter::PinholeToGrating].map(|p| jacobian.by(p)[2]);
     let c = &found.covariance;
     let carried = by[0] * by[0] * c[(0, 0)] + 2.0 * by[0] * by[1] * c[(0, 1)] + by[1] * by[1] * c[(1, 1)];
     (carried.max(0.0) + height_sigma * height_sigma).sqrt()

@@ -431,6 +431,8 @@ fn write_optics(
     let file = OpticsFile {
         format: Some(OpticsFile::FORMAT.to_owned()),
         provenance: Some(provenance),
+        date: None,
+        covariance: None,
         optics: optics_section::with_calibrated(&experiment.optics, optics),
     };
     let path = directory.join("optics.toml");

@@ -3,8 +3,8 @@
 use std::time::Instant;
 
 use daic_optics::{
-    Brown, Camera, Decoder, Grating, Observation, Optics, Parameter, PixelPair, Settings, Substrate,
-    SubstrateSide, TrackedPoint, View, calibrate,
+    Brown, Camera, Decoder, Grating, Observation, Optics, PixelPair, Settings, Substrate, SubstrateSide,
+    TrackedPoint, View, calibrate,
 };
 use nalgebra::Vector3;
 
@@ -23,6 +23,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         grating_to_reference_mm: 109.0,
         minus: grating,
         plus: grating,
+        reference: Default::default(),
     };
     let model = optics.model()?;
     let points: Vec<_> = (0..100_000)
@@ -94,7 +95,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         tracked.push(TrackedPoint { frames });
     }
     let mut start = optics;
-    for p in Parameter::ALL {
+    for p in daic_optics::calibrate::SUPPORTED {
         let value = 1.01 * p.get(&optics);
         p.set(&mut start, value);
     }

@@ -87,23 +87,34 @@ impl Camera {
 /// The camera for any scalar.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CameraModel<T> {
-    pub(crate) focal: T,
-    pub(crate) principal_point: [T; 2],
-    pub(crate) brown: Brown,
+    focal: T,
+    principal_point: [T; 2],
+    brown: Coefficients<T>,
+    /// Whether the distortion or a derivative by it is anything but zero.
+    distorting: bool,
 }
+
+/// k1, k2, k3, p1, p2.
+type Coefficients<T> = [T; 5];
 
 impl<T: Real> CameraModel<T> {
     pub(crate) fn new(camera: &Camera) -> Self {
-        Self {
-            focal: T::constant(camera.focal_px),
-            principal_point: camera.principal_point_px.map(T::constant),
-            brown: camera.brown,
-        }
+        let b = &camera.brown;
+        Self::of(
+            T::constant(camera.focal_px),
+            camera.principal_point_px.map(T::constant),
+            [b.k1, b.k2, b.k3, b.p1, b.p2].map(T::constant),
+        )
+    }
+
+    pub(crate) fn of(focal: T, principal_point: [T; 2], brown: Coefficients<T>) -> Self {
+        let distorting = brown.iter().any(|c| c.value() != 0.0 || !c.is_constant());
+        Self { focal, principal_point, brown, distorting }
     }
 
     #[inline]
     pub(crate) fn pixel(&self, q: [T; 2]) -> [T; 2] {
-        let [x, y] = distort(&self.brown, q);
+        let [x, y] = if self.distorting { distort(&self.brown, q) } else { q };
         [self.focal * x + self.principal_point[0], self.focal * y + self.principal_point[1]]
     }
 
@@ -113,52 +124,58 @@ impl<T: Real> CameraModel<T> {
             (pixel[0] - self.principal_point[0]) / self.focal,
             (pixel[1] - self.principal_point[1]) / self.focal,
         ];
-        if self.brown == Brown::default() {
+        if !self.distorting {
             return Ok(observed);
         }
         undistort(&self.brown, observed).ok_or(UndistortError { pixel_px: pixel.map(T::value) })
     }
+
+    /// Whether the distortion is one to one at the ideal coordinates `q` (it folds over where not).
+    pub(crate) fn is_invertible(&self, q: [f64; 2]) -> bool {
+        !self.distorting || is_invertible(&self.brown.map(T::value), q)
+    }
 }
 
 #[inline]
-fn distort<T: Real>(b: &Brown, [x, y]: [T; 2]) -> [T; 2] {
+fn distort<T: Real>(b: &Coefficients<T>, [x, y]: [T; 2]) -> [T; 2] {
     let k = T::constant;
+    let [k1, k2, k3, p1, p2] = *b;
     let (xx, yy, xy) = (x * x, y * y, x * y);
     let r2 = xx + yy;
-    let radial = k(1.0) + r2 * (k(b.k1) + r2 * (k(b.k2) + r2 * k(b.k3)));
-    let (p1, p2) = (k(b.p1), k(b.p2));
+    let radial = k(1.0) + r2 * (k1 + r2 * (k2 + r2 * k3));
     let two = k(2.0);
     [x * radial + two * p1 * xy + p2 * (r2 + two * xx), y * radial + p1 * (r2 + two * yy) + two * p2 * xy]
 }
 
 /// ∂(observed)/∂(ideal) at the ideal coordinates `q`, and the observed coordinates.
-fn distort_jacobian(b: &Brown, q: [f64; 2]) -> ([f64; 2], [[f64; 2]; 2]) {
-    let d = distort(b, [Dual::<2>::variable(q[0], 0), Dual::<2>::variable(q[1], 1)]);
+fn distort_jacobian(b: &Coefficients<f64>, q: [f64; 2]) -> ([f64; 2], [[f64; 2]; 2]) {
+    let b = b.map(Dual::constant);
+    let d = distort(&b, [Dual::<2>::variable(q[0], 0), Dual::<2>::variable(q[1], 1)]);
     (d.map(|d| d.value), d.map(|d| d.gradient))
 }
 
-/// Whether the model is one to one at the ideal coordinates `q` (it folds over where not).
-pub(crate) fn is_invertible(b: &Brown, q: [f64; 2]) -> bool {
+fn is_invertible(b: &Coefficients<f64>, q: [f64; 2]) -> bool {
     let (_, m) = distort_jacobian(b, q);
     m[0][0] > 0.0 && m[0][0] * m[1][1] - m[0][1] * m[1][0] > 0.0
 }
 
-fn undistort<T: Real>(b: &Brown, observed: [T; 2]) -> Option<[T; 2]> {
+fn undistort<T: Real>(brown: &Coefficients<T>, observed: [T; 2]) -> Option<[T; 2]> {
+    let b = brown.map(T::value);
     let target = observed.map(T::value);
     let mut q = target;
     for _ in 0..30 {
-        let (at, m) = distort_jacobian(b, q);
+        let (at, m) = distort_jacobian(&b, q);
         let step = solve2(m, [at[0] - target[0], at[1] - target[1]])?;
         q = [q[0] - step[0], q[1] - step[1]];
         // Convergence is quadratic: after a step this small the error is below rounding.
         if step[0].abs() + step[1].abs() < 1e-9 {
-            if !is_invertible(b, q) {
+            if !is_invertible(&b, q) {
                 return None;
             }
             // One more step in the caller's scalar brings in its derivatives exactly.
-            let (_, m) = distort_jacobian(b, q);
+            let (_, m) = distort_jacobian(&b, q);
             let q = q.map(T::constant);
-            let at = distort(b, q);
+            let at = distort(brown, q);
             let step = solve2(m, [at[0] - observed[0], at[1] - observed[1]])?;
             return Some([q[0] - step[0], q[1] - step[1]]);
         }

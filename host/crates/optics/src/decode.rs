@@ -1,11 +1,12 @@
 //! From a pixel pair to a point, by three models behind one interface.
 
-use nalgebra::{Matrix3, Matrix3x4, Matrix4, Vector3};
+use nalgebra::{Matrix3, Matrix3x4, Matrix4, SMatrix, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::model::{OpticalModel, Setup, TraceError};
+use crate::model::{OpticalModel, Paraxial, Setup, TraceError};
+use crate::parameter::{ParameterCovariance, ParameterJacobian};
 use crate::real::{Dual, Real, along, dot, sub};
-use crate::setup::{Parameter, View};
+use crate::setup::View;
 
 /// How a pixel pair becomes a point.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -75,6 +76,25 @@ impl Decoded {
     }
 }
 
+/// A decoded point and its covariance in two parts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct UncertainPoint {
+    /// The point.
+    pub decoded: Decoded,
+    /// Covariance (mm²) from the pixels, independent from point to point.
+    pub independent_mm2: Matrix3<f64>,
+    /// Covariance (mm²) from the calibration, shared with all other points:
+    /// [`ParameterCovariance::between`] gives it between two.
+    pub common_mm2: Matrix3<f64>,
+}
+
+impl UncertainPoint {
+    /// Standard deviations of (x, y, h) from both parts together, mm.
+    pub fn sigma_mm(&self) -> Vector3<f64> {
+        (self.independent_mm2 + self.common_mm2).diagonal().map(f64::sqrt)
+    }
+}
+
 /// Displacement of a material point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Displacement {
@@ -114,16 +134,41 @@ impl OpticalModel {
         Ok(p.into())
     }
 
-    /// Derivatives (3×3) of the decoded point with respect to [`Parameter::ALL`], in this order:
-    /// what the covariance of a calibration does to a point, in common for all points.
+    /// Derivatives (mm per unit of each field) of the decoded point with respect to every
+    /// parameter: what the covariance of a calibration does to a point, in common for all points.
     ///
     /// # Errors
     /// As [`OpticalModel::decode`].
-    pub fn parameter_jacobian(&self, decoder: Decoder, pair: PixelPair) -> Result<Matrix3<f64>, TraceError> {
-        const { assert!(Parameter::ALL.len() == 3) };
-        let constant = |p: [f64; 2]| p.map(Dual::<3>::constant);
+    pub fn parameter_jacobian(
+        &self,
+        decoder: Decoder,
+        pair: PixelPair,
+    ) -> Result<ParameterJacobian<3>, TraceError> {
+        let constant = |p: [f64; 2]| p.map(Dual::constant);
         let (p, _) = decode(&self.by_parameters, decoder, constant(pair.minus_px), constant(pair.plus_px))?;
-        Ok(Matrix3::from_fn(|i, j| p[i].gradient[j]))
+        Ok(ParameterJacobian(SMatrix::from_fn(|i, j| p[i].gradient[j])))
+    }
+
+    /// The point with its covariance in two parts: what the pixels' noise does to this point
+    /// alone, and what the calibration's does to it in common with all others.
+    ///
+    /// # Errors
+    /// As [`OpticalModel::decode`].
+    pub fn decode_with_covariance(
+        &self,
+        decoder: Decoder,
+        pair: PixelPair,
+        pixels_px2: &Matrix4<f64>,
+        calibration: &ParameterCovariance,
+    ) -> Result<UncertainPoint, TraceError> {
+        let decoded = self.decode(decoder, pair)?;
+        let common_mm2 = if calibration.parameters().is_empty() {
+            Matrix3::zeros()
+        } else {
+            let by = self.parameter_jacobian(decoder, pair)?;
+            calibration.between(&by, &by)
+        };
+        Ok(UncertainPoint { independent_mm2: decoded.covariance_mm2(pixels_px2), common_mm2, decoded })
     }
 
     /// Displacement of a material point tracked in both views.
@@ -166,8 +211,8 @@ fn decode<T: Real>(
     if !(finite(minus) && finite(plus)) {
         return Err(TraceError::NotFinite);
     }
-    let minus = setup.camera.direction(minus)?;
-    let plus = setup.camera.direction(plus)?;
+    let minus = setup.direction(View::Minus, minus)?;
+    let plus = setup.direction(View::Plus, plus)?;
     match decoder {
         Decoder::Ray => by_rays(setup, minus, plus),
         Decoder::Closed | Decoder::Linear => {
@@ -210,8 +255,7 @@ fn by_virtual_object<T: Real>(
 ) -> Result<([T; 3], f64), TraceError> {
     let one = T::constant(1.0);
     let half = T::constant(0.5);
-    let (s, d) = (setup.s, setup.d);
-    let sin = setup.mean_sin_theta;
+    let Paraxial { s, d, sin_theta: sin } = setup.paraxial;
     let cos = (one - sin * sin).sqrt();
     let (tan, c3) = (sin / cos, cos * cos * cos);
     // u*/F, v*/F and the middle of the two views.
@@ -234,5 +278,6 @@ fn by_virtual_object<T: Real>(
         return Err(TraceError::BeforeGrating { distance_mm });
     }
     let gap = (v * scale).value().abs();
-    Ok(([middle[0] * scale, middle[1] * scale, h], gap))
+    let world = [middle[0] * scale, middle[1] * scale, s + d - h];
+    Ok((setup.object(world), gap))
 }

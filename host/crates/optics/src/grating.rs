@@ -45,7 +45,7 @@ impl Default for Substrate {
 
 /// A transmission grating: pitch, pose and substrate.
 ///
-/// Its frame is the world's turned by R = Rz·Ry·Rx about the pivot (0, 0, s): across the grooves
+/// Its frame is the world's turned by R = Rz·Ry·Rx about its pivot (0, 0, s + offset): across the grooves
 /// t̂ = R·x̂, along them ĝ = R·ŷ, normal n̂ = R·ẑ (towards the object). The plane of the grooves
 /// contains the pivot.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -56,6 +56,10 @@ pub struct Grating {
     /// Rotation about x, y and z in radians, applied in this order.
     #[serde(default)]
     pub tilt_rad_xyz: [f64; 3],
+    /// How far its pivot lies behind the common one at s, in millimetres: two separate gratings may
+    /// stand at different distances.
+    #[serde(default)]
+    pub offset_mm: f64,
     /// Plate that carries the grooves.
     #[serde(default)]
     pub substrate: Substrate,
@@ -89,7 +93,7 @@ pub enum DiffractError {
 impl Grating {
     /// A grating square to the optical axis, without substrate.
     pub fn square(pitch_mm: f64) -> Self {
-        Self { pitch_mm, tilt_rad_xyz: [0.0; 3], substrate: Substrate::NONE }
+        Self { pitch_mm, tilt_rad_xyz: [0.0; 3], offset_mm: 0.0, substrate: Substrate::NONE }
     }
 
     /// The grating's frame, computed once for many rays.

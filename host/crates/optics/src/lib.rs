@@ -7,7 +7,8 @@
 //! * World: origin in the pinhole, x right, y down, z along the optical axis towards the object.
 //!   The grating's pivot is at (0, 0, s), the reference plane at z = s + d.
 //! * Object coordinates (x, y, h), millimetres: origin where the optical axis meets the reference
-//!   plane, x right, y down, h towards the camera, so z = s + d − h.
+//!   plane, x right, y down, h towards the camera, so z = s + d − h; [`ReferenceFrame`] turns and
+//!   shifts them with a reference plane that is not square to the axis.
 //! * Pixels: (0, 0) is the centre of the first pixel, x right, y down.
 //! * The view on the left half of the sensor is [`View::Minus`]. Traced from the pinhole its rays
 //!   take order m = +1 in α' = α + mλ/p, those of [`View::Plus`] m = −1.
@@ -19,26 +20,38 @@
 //! work: decoding a pixel pair ([`OpticalModel::decode`]), projecting a point
 //! ([`OpticalModel::project`]), displacement of a material point
 //! ([`OpticalModel::displacement`]), the expected disparity ([`OpticalModel::disparity_range`]).
-//! [`calibrate`](calibrate::calibrate) estimates parameters from points tracked through known moves.
+//! Dense distortion maps ([`maps`]) may stand in for the camera's Brown terms or on top of them.
+//! [`calibrate`](calibrate::calibrate) estimates F and the distances from points tracked through
+//! known moves, [`bundle`] everything from views of a plate in several poses.
 
 #![allow(
     clippy::neg_cmp_op_on_partial_ord,
     reason = "!(a > b) is written where a NaN must be refused as well"
 )]
 
+mod banded;
+pub mod bundle;
 pub mod calibrate;
 pub mod camera;
 pub mod decode;
 pub mod grating;
+pub mod maps;
 mod model;
+pub mod parameter;
 mod project;
 mod real;
+mod robust;
 mod setup;
 
+pub use bundle::{Component, RigCalibration, RigData, RigError, RigSettings, calibrate_rig};
 pub use calibrate::{CalibrateError, Calibration, Estimate, Observation, Settings, TrackedPoint, calibrate};
 pub use camera::{Brown, Camera, UndistortError};
-pub use decode::{Decoded, Decoder, Displacement, PixelPair, pixel_covariance};
+pub use decode::{Decoded, Decoder, Displacement, PixelPair, UncertainPoint, pixel_covariance};
 pub use grating::{DiffractError, Grating, GratingFrame, Substrate, SubstrateSide};
+pub use maps::{DistortionMap, DistortionMaps, MapError, MapFit, MapGrid, MapSample};
 pub use model::{OpticalModel, Ray, TraceError};
+pub use parameter::{
+    CovarianceError, GratingParameter, Parameter, ParameterCovariance, ParameterJacobian, UnknownParameter,
+};
 pub use project::DisparityRange;
-pub use setup::{Optics, OpticsError, Parameter, View};
+pub use setup::{Optics, OpticsError, ReferenceFrame, View};

@@ -3,12 +3,12 @@
 //! The grating leaves no closed form, so Newton's iteration runs on the ideal direction of the
 //! line of sight; lens distortion is applied afterwards and costs no iteration.
 
-use nalgebra::{Matrix2x3, Vector3};
+use nalgebra::{Matrix2x3, SMatrix, Vector3};
 
-use crate::camera::is_invertible;
 use crate::model::{OpticalModel, Setup, TraceError};
+use crate::parameter::ParameterJacobian;
 use crate::real::{Dual, Real, solve2};
-use crate::setup::View;
+use crate::setup::{Optics, View};
 
 /// Range of the displacement from the −1 to the +1 view over a range of heights, in pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -35,7 +35,8 @@ fn aim(
     p: [f64; 3],
     start: Option<[f64; 2]>,
 ) -> Result<([f64; 2], [[f64; 2]; 2]), TraceError> {
-    let not_seen = || TraceError::NotSeen { view, point_mm: [p[0], p[1], (setup.s + setup.d).value - p[2]] };
+    let not_seen =
+        || TraceError::NotSeen { view, point_mm: setup.object(p.map(Dual::constant)).map(Dual::value) };
     if !p.iter().all(|c| c.is_finite()) {
         return Err(TraceError::NotFinite);
     }
@@ -45,10 +46,10 @@ fn aim(
     }
     let mut q = start.unwrap_or_else(|| {
         // Virtual object of the paraxial model: at ∓z·tan θ, z/cos³θ behind the grating.
-        let sin = setup.mean_sin_theta.value;
+        let (sin, s) = (setup.paraxial.sin_theta.value, setup.paraxial.s.value);
         let cos = (1.0 - sin * sin).sqrt();
-        let z = p[2] - setup.s.value;
-        let depth = setup.s.value + z / (cos * cos * cos);
+        let z = p[2] - s;
+        let depth = s + z / (cos * cos * cos);
         let x = p[0] - view.traced_order() * z * sin / cos;
         [x / depth, p[1] / depth]
     });
@@ -79,14 +80,17 @@ pub(crate) fn project<T: Real>(
     let world = setup.world(p);
     let (q, jacobian) = aim(newton, view, world.map(T::value), start)?;
     let not_seen = TraceError::NotSeen { view, point_mm: p.map(T::value) };
-    if !is_invertible(&setup.camera.brown, q) {
-        return Err(not_seen);
-    }
     // One more Newton step in T: by the implicit function theorem it carries exact derivatives.
     let q = q.map(T::constant);
     let m = miss(setup, view, q, world)?;
     let step = solve2(jacobian, m).ok_or(not_seen)?;
-    Ok(setup.camera.pixel([q[0] - step[0], q[1] - step[1]]))
+    setup.pixel(view, [q[0] - step[0], q[1] - step[1]]).ok_or(not_seen)?
+}
+
+/// Direction of an observed pixel but for the distortion: a start for the forward model.
+pub(crate) fn near(optics: &Optics, pixel: [f64; 2]) -> Option<[f64; 2]> {
+    let c = &optics.camera;
+    Some([0, 1].map(|i| (pixel[i] - c.principal_point_px[i]) / c.focal_px))
 }
 
 impl OpticalModel {
@@ -113,6 +117,21 @@ impl OpticalModel {
         let pixel = project(&self.by_point, &self.by_direction, view, p, None)?;
         let [x, y] = pixel.map(|c| c.gradient);
         Ok((pixel.map(|c| c.value), Matrix2x3::new(x[0], x[1], x[2], y[0], y[1], y[2])))
+    }
+
+    /// Derivatives (px per unit of each field) of the pixel at which `view` sees the point with
+    /// respect to every parameter.
+    ///
+    /// # Errors
+    /// As [`OpticalModel::project`].
+    pub fn project_parameter_jacobian(
+        &self,
+        view: View,
+        point_mm: Vector3<f64>,
+    ) -> Result<ParameterJacobian<2>, TraceError> {
+        let p: [f64; 3] = point_mm.into();
+        let pixel = project(&self.by_parameters, &self.by_direction, view, p.map(Dual::constant), None)?;
+        Ok(ParameterJacobian(SMatrix::from_fn(|i, j| pixel[i].gradient[j])))
     }
 
     /// Pixel in the other view of what pixel `pixel_px` of view `from` sees at height `height_mm`.

@@ -8,6 +8,8 @@ pub(crate) trait Real:
 {
     fn constant(value: f64) -> Self;
     fn value(self) -> f64;
+    /// Whether every derivative is zero.
+    fn is_constant(self) -> bool;
     fn sqrt(self) -> Self;
     fn sin_cos(self) -> (Self, Self);
 }
@@ -20,6 +22,10 @@ impl Real for f64 {
     #[inline]
     fn value(self) -> f64 {
         self
+    }
+    #[inline]
+    fn is_constant(self) -> bool {
+        true
     }
     #[inline]
     fn sqrt(self) -> Self {
@@ -72,6 +78,10 @@ impl<const N: usize> Real for Dual<N> {
     #[inline]
     fn value(self) -> f64 {
         self.value
+    }
+    #[inline]
+    fn is_constant(self) -> bool {
+        self.gradient.iter().all(|g| *g == 0.0)
     }
     #[inline]
     fn sqrt(self) -> Self {

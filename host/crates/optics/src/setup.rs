@@ -47,49 +47,20 @@ impl View {
     }
 }
 
-/// A quantity of the set-up that can be estimated or carry an uncertainty.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-#[non_exhaustive]
-pub enum Parameter {
-    /// [`Camera::focal_px`].
-    FocalPx,
-    /// [`Optics::pinhole_to_grating_mm`].
-    PinholeToGrating,
-    /// [`Optics::grating_to_reference_mm`].
-    GratingToReference,
-}
-
-impl Parameter {
-    /// Every parameter, in the order used for vectors and matrices over all of them.
-    pub const ALL: [Self; 3] = [Self::FocalPx, Self::PinholeToGrating, Self::GratingToReference];
-
-    /// Name of the field it stands for.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::FocalPx => "camera.focal_px",
-            Self::PinholeToGrating => "pinhole_to_grating_mm",
-            Self::GratingToReference => "grating_to_reference_mm",
-        }
-    }
-
-    /// Its value in `optics`.
-    pub fn get(self, optics: &Optics) -> f64 {
-        match self {
-            Self::FocalPx => optics.camera.focal_px,
-            Self::PinholeToGrating => optics.pinhole_to_grating_mm,
-            Self::GratingToReference => optics.grating_to_reference_mm,
-        }
-    }
-
-    /// Sets it in `optics`, unchecked.
-    pub fn set(self, optics: &mut Optics, value: f64) {
-        match self {
-            Self::FocalPx => optics.camera.focal_px = value,
-            Self::PinholeToGrating => optics.pinhole_to_grating_mm = value,
-            Self::GratingToReference => optics.grating_to_reference_mm = value,
-        }
-    }
+/// Where the object coordinates lie, other than square to the optical axis.
+///
+/// The world point of the object point (x, y, h) is (o_x, o_y, s + d) + R·(x, y, −h) with
+/// R = Rz·Ry·Rx in world axes: the reference plane h = 0 passes through (o_x, o_y, s + d) and is
+/// turned by R. All zero is the plane square to the axis with its origin on it. A calibration that
+/// sees a flat plate fixes the plate far better than the optical axis, so its heights count from
+/// the plate.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ReferenceFrame {
+    /// Rotation about x, y and z in radians, applied in this order.
+    pub tilt_rad_xyz: [f64; 3],
+    /// World x and y (mm) of the origin.
+    pub origin_mm: [f64; 2],
 }
 
 /// A set-up: camera, light, distances and the grating in each view's path.
@@ -108,6 +79,9 @@ pub struct Optics {
     pub minus: Grating,
     /// Grating in the path of the +1 view; the same as `minus` where one serves both.
     pub plus: Grating,
+    /// Where the object coordinates lie.
+    #[serde(default)]
+    pub reference: ReferenceFrame,
 }
 
 /// A parameter outside its limits.
@@ -165,27 +139,40 @@ impl Optics {
         ] {
             check(field, value, value > 0.0, POSITIVE)?;
         }
-        const MINUS: [&str; 6] = [
+        let r = &self.reference;
+        for (field, value) in [
+            ("reference.tilt_rad_xyz[0]", r.tilt_rad_xyz[0]),
+            ("reference.tilt_rad_xyz[1]", r.tilt_rad_xyz[1]),
+            ("reference.tilt_rad_xyz[2]", r.tilt_rad_xyz[2]),
+        ] {
+            // About z a plate may lie in any direction.
+            check(field, value, value.abs() <= std::f64::consts::PI, "between −π and π (radians)")?;
+        }
+        check("reference.origin_mm[0]", r.origin_mm[0], true, FINITE)?;
+        check("reference.origin_mm[1]", r.origin_mm[1], true, FINITE)?;
+        const MINUS: [&str; 7] = [
             "minus.pitch_mm",
             "minus.tilt_rad_xyz[0]",
             "minus.tilt_rad_xyz[1]",
             "minus.tilt_rad_xyz[2]",
             "minus.substrate.thickness_mm",
             "minus.substrate.index",
+            "minus.offset_mm",
         ];
-        const PLUS: [&str; 6] = [
+        const PLUS: [&str; 7] = [
             "plus.pitch_mm",
             "plus.tilt_rad_xyz[0]",
             "plus.tilt_rad_xyz[1]",
             "plus.tilt_rad_xyz[2]",
             "plus.substrate.thickness_mm",
             "plus.substrate.index",
+            "plus.offset_mm",
         ];
         self.check_grating(&self.minus, MINUS)?;
         self.check_grating(&self.plus, PLUS)
     }
 
-    fn check_grating(&self, g: &Grating, names: [&'static str; 6]) -> Result<(), OpticsError> {
+    fn check_grating(&self, g: &Grating, names: [&'static str; 7]) -> Result<(), OpticsError> {
         check(
             names[0],
             g.pitch_mm,
@@ -195,14 +182,19 @@ impl Optics {
         for (tilt, name) in g.tilt_rad_xyz.into_iter().zip(&names[1..4]) {
             check(name, tilt, tilt.abs() < std::f64::consts::FRAC_PI_2, "between −π/2 and π/2 (radians)")?;
         }
+        // Room in front of the grooves and behind them.
+        let (front, back) =
+            (self.pinhole_to_grating_mm + g.offset_mm, self.grating_to_reference_mm - g.offset_mm);
+        check(
+            names[6],
+            g.offset_mm,
+            front > 0.0 && back > 0.0,
+            "above −pinhole_to_grating_mm and below grating_to_reference_mm",
+        )?;
         let s = &g.substrate;
         let (room, allowed) = match s.side {
-            SubstrateSide::Camera => {
-                (self.pinhole_to_grating_mm, "at least 0 and below pinhole_to_grating_mm")
-            }
-            SubstrateSide::Object => {
-                (self.grating_to_reference_mm, "at least 0 and below grating_to_reference_mm")
-            }
+            SubstrateSide::Camera => (front, "at least 0 and below pinhole_to_grating_mm"),
+            SubstrateSide::Object => (back, "at least 0 and below grating_to_reference_mm"),
         };
         let fits = s.thickness_mm >= 0.0 && s.thickness_mm < room;
         check(names[4], s.thickness_mm, fits, allowed)?;
@@ -215,5 +207,27 @@ impl Optics {
     /// As [`Optics::validate`].
     pub fn model(&self) -> Result<OpticalModel, OpticsError> {
         OpticalModel::new(self)
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests_support {
+    use super::*;
+
+    /// Some set-up.
+    pub(crate) fn any() -> Optics {
+        Optics {
+            camera: Camera {
+                focal_px: 17956.2,
+                principal_point_px: [1295.5, 971.5],
+                brown: Default::default(),
+            },
+            wavelength_mm: 633e-6,
+            pinhole_to_grating_mm: 307.0,
+            grating_to_reference_mm: 109.0,
+            minus: Grating::square(1.0 / 300.0),
+            plus: Grating::square(1.0 / 300.0),
+            reference: ReferenceFrame::default(),
+        }
     }
 }

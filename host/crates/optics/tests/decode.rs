@@ -3,7 +3,9 @@
 mod common;
 
 use common::*;
-use daic_optics::{Decoder, Optics, PixelPair, TraceError, View, pixel_covariance};
+use daic_optics::{
+    Decoder, Optics, Parameter, ParameterCovariance, PixelPair, TraceError, View, pixel_covariance,
+};
 use nalgebra::{Matrix3, Matrix4, Vector3};
 
 const DECODERS: [Decoder; 3] = [Decoder::Ray, Decoder::Closed, Decoder::Linear];
@@ -147,18 +149,6 @@ fn jacobians_match_central_differences() {
                     let off = (d.jacobian.column(j) - fd).amax();
                     // Central differences: rounding 1e-13/1e-3 mm/px and more; entries are 0.01 to 0.06.
                     assert!(off < 2e-9, "{decoder:?} {j}: {off:e}");
-                }
-                let by = m.parameter_jacobian(decoder, pair).unwrap();
-                for (j, parameter) in daic_optics::Parameter::ALL.into_iter().enumerate() {
-                    let moved = |by: f64| {
-                        let mut o = o;
-                        let value = parameter.get(&o) + by;
-                        parameter.set(&mut o, value);
-                        o.model().unwrap().decode_point(decoder, pair).unwrap()
-                    };
-                    let fd = (moved(e) - moved(-e)) / (2.0 * e);
-                    let off = (by.column(j) - fd).amax();
-                    assert!(off < 2e-9, "{decoder:?} {parameter:?}: {off:e}");
                 }
             }
             for view in View::BOTH {
@@ -331,12 +321,14 @@ fn covariance_matches_monte_carlo() {
     let sigma = [0.02, 0.03, 0.05, 0.04];
     let d = m.decode(Decoder::Ray, pair).unwrap();
     let pixels = pixel_covariance([sigma[0], sigma[1]], [sigma[2], sigma[3]]);
-    let parameters = [3.0, 0.05, 0.02];
-    let by = m.parameter_jacobian(Decoder::Ray, pair).unwrap();
-    let expected = [
-        d.covariance_mm2(&pixels),
-        by * Matrix3::from_diagonal(&Vector3::from(parameters.map(|s| s * s))) * by.transpose(),
+    let uncertain = [
+        (Parameter::FocalPx, 3.0),
+        (Parameter::PinholeToGrating, 0.05),
+        (Parameter::GratingToReference, 0.02),
     ];
+    let covariance = ParameterCovariance::independent(&uncertain).unwrap();
+    let both = m.decode_with_covariance(Decoder::Ray, pair, &pixels, &covariance).unwrap();
+    let expected = [both.independent_mm2, both.common_mm2];
     let n = 20_000;
     let mut found = [Matrix3::zeros(); 2];
     for _ in 0..n {
@@ -346,7 +338,7 @@ fn covariance_matches_monte_carlo() {
             q.plus_px[c] += sigma[2 + c] * noise.next();
         }
         let mut wrong = o;
-        for (p, s) in daic_optics::Parameter::ALL.into_iter().zip(parameters) {
+        for (p, s) in uncertain {
             p.set(&mut wrong, p.get(&o) + s * noise.next());
         }
         let by_pixels = m.decode_point(Decoder::Ray, q).unwrap();

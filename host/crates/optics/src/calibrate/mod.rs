@@ -27,7 +27,8 @@ use nalgebra::{DMatrix, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::decode::PixelPair;
-use crate::setup::{Optics, OpticsError, Parameter};
+use crate::parameter::Parameter;
+use crate::setup::{Optics, OpticsError};
 
 /// A point seen in both views of one frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -45,11 +46,16 @@ pub struct TrackedPoint {
     pub frames: Vec<Option<Observation>>,
 }
 
+/// What moves can determine without knowing the specimen. Everything else needs a plate seen in
+/// several poses: [`bundle`](crate::bundle).
+pub const SUPPORTED: [Parameter; 3] =
+    [Parameter::FocalPx, Parameter::PinholeToGrating, Parameter::GratingToReference];
+
 /// What to estimate and when to be content.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Settings {
-    /// Parameters to estimate; the others keep their starting values.
+    /// Parameters to estimate, of [`SUPPORTED`]; the others keep their starting values.
     pub parameters: Vec<Parameter>,
     /// Mean height (mm) of the points used at displacement zero: the datum that fixes
     /// [`Parameter::GratingToReference`]. Not needed for the others.
@@ -69,7 +75,7 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Self {
-            parameters: Parameter::ALL.to_vec(),
+            parameters: SUPPORTED.to_vec(),
             reference_height_mm: Some(0.0),
             outlier_limit: 5.0,
             max_outlier_fraction: 0.2,
@@ -136,6 +142,9 @@ pub enum CalibrateError {
     /// No parameter to estimate was named, or one twice.
     #[error("the list of parameters to estimate is empty or names one twice")]
     Parameters,
+    /// A parameter that tracked points of unknown shape are not asked to determine.
+    #[error("{} cannot be estimated from moves of a specimen of unknown shape", .0.name())]
+    Unsupported(Parameter),
     /// A setting is out of its limits.
     #[error("setting {name} is {value}, it must be {allowed}")]
     Setting {
@@ -229,7 +238,7 @@ fn remedy(parameter: Parameter) -> &'static str {
         Parameter::FocalPx | Parameter::PinholeToGrating => {
             "add frames moved along z (and in-plane) by known amounts, larger moves or more points"
         }
-        Parameter::GratingToReference => "add larger moves along z or more points",
+        _ => "add larger moves along z or more points",
     }
 }
 
@@ -257,6 +266,9 @@ fn check_settings(s: &Settings) -> Result<(), CalibrateError> {
     let repeated = (1..s.parameters.len()).any(|i| s.parameters[..i].contains(&s.parameters[i]));
     if s.parameters.is_empty() || repeated {
         return Err(CalibrateError::Parameters);
+    }
+    if let Some(p) = s.parameters.iter().find(|p| !SUPPORTED.contains(p)) {
+        return Err(CalibrateError::Unsupported(*p));
     }
     for (name, value) in [("outlier_limit", s.outlier_limit), ("max_relative_sigma", s.max_relative_sigma)] {
         // Negated so that NaN is refused.

@@ -5,15 +5,16 @@ use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use super::normal::{Block, FREE, Normal};
 use super::{CalibrateError, Calibration, Estimate, Observation, Settings, TrackedPoint};
 use crate::decode::Decoder;
+use crate::maps::DistortionMaps;
 use crate::model::{OpticalModel, Setup, TraceError};
-use crate::project::project;
+use crate::parameter::Parameter;
+use crate::project::{near, project};
 use crate::real::{Dual, Real};
-use crate::setup::{Optics, Parameter, View};
+use crate::robust::{HUBER, Loss, spread};
+use crate::setup::{Optics, View};
 
 /// Derivatives by a point's three coordinates, then by the parameters.
 type D = Dual<{ 3 + FREE }>;
-/// Huber's constant: 95 % efficiency for normal errors.
-const HUBER: f64 = 1.345;
 
 pub(super) struct Problem<'a> {
     displacements: &'a [Vector3<f64>],
@@ -28,30 +29,6 @@ struct State {
     optics: Optics,
     /// Points (x, y, h) at displacement zero.
     positions: Vec<Vector3<f64>>,
-}
-
-/// Loss of the normalised residuals.
-#[derive(Clone, Copy)]
-enum Loss {
-    Squares,
-    /// Linear beyond this many standard deviations.
-    Huber(f64),
-}
-
-impl Loss {
-    fn of(self, r: f64) -> f64 {
-        match self {
-            Self::Huber(k) if r.abs() > k => k * (2.0 * r.abs() - k),
-            _ => r * r,
-        }
-    }
-
-    fn weight(self, r: f64) -> f64 {
-        match self {
-            Self::Huber(k) if r.abs() > k => k / r.abs(),
-            _ => 1.0,
-        }
-    }
 }
 
 impl<'a> Problem<'a> {
@@ -138,8 +115,8 @@ impl<'a> Problem<'a> {
 
     /// Residuals (observed − predicted) in pixels of the four coordinates of every slot in use.
     fn residuals(&self, state: &State, active: &[bool]) -> Result<Vec<[f64; 4]>, TraceError> {
-        let plain = Setup::<f64>::new(&state.optics);
-        let newton = Setup::new(&state.optics);
+        let plain = Setup::<f64>::new(&state.optics, &DistortionMaps::NONE);
+        let newton = Setup::new(&state.optics, &DistortionMaps::NONE);
         let mut all = vec![[0.0; 4]; active.len()];
         for (i, position) in state.positions.iter().enumerate() {
             for (k, shift) in self.displacements.iter().enumerate() {
@@ -172,22 +149,11 @@ impl<'a> Problem<'a> {
         flat
     }
 
-    /// Robust standard deviation of the normalised residuals, at least 1.
-    fn spread(normalised: &[f64]) -> f64 {
-        let mut magnitude: Vec<f64> = normalised.iter().map(|r| r.abs()).collect();
-        if magnitude.is_empty() {
-            return 1.0;
-        }
-        let half = magnitude.len() / 2;
-        let (_, middle, _) = magnitude.select_nth_unstable_by(half, f64::total_cmp);
-        (1.4826 * *middle).max(1.0)
-    }
-
     /// The usable observations that agree with the state.
     fn select(&self, state: &State, usable: &[bool]) -> Result<Vec<bool>, CalibrateError> {
         let residuals =
             self.residuals(state, usable).map_err(|_| CalibrateError::NotConverged { iterations: 0 })?;
-        let spread = Self::spread(&self.normalised(&residuals, usable));
+        let spread = spread(self.normalised(&residuals, usable));
         let limit = self.settings.outlier_limit * spread;
         let frames = self.displacements.len();
         let selected: Vec<bool> = (0..usable.len())
@@ -209,11 +175,12 @@ impl<'a> Problem<'a> {
 
     /// Normal equations at `state`.
     fn linearise(&self, state: &State, active: &[bool], loss: Loss) -> Result<Normal, TraceError> {
-        let mut setup = Setup::<D>::new(&state.optics);
-        let newton = Setup::new(&state.optics);
-        for (j, p) in self.free.iter().enumerate() {
-            setup.set(*p, Dual::variable(p.get(&state.optics), 3 + j));
-        }
+        let place = |p| self.free.iter().position(|f| *f == p);
+        let setup = Setup::<D>::with(&state.optics, &DistortionMaps::NONE, |p, value| match place(p) {
+            Some(j) => Dual::variable(value, 3 + j),
+            None => Dual::constant(value),
+        });
+        let newton = Setup::new(&state.optics, &DistortionMaps::NONE);
         let n = self.free.len();
         let mut normal = Normal {
             a: DMatrix::zeros(n, n),
@@ -272,7 +239,8 @@ impl<'a> Problem<'a> {
         let mut residuals = self.residuals(state, active).map_err(|_| failed(0))?;
         for iteration in 1..=self.settings.max_iterations {
             let normalised = self.normalised(&residuals, active);
-            let loss = if robust { Loss::Huber(HUBER * Self::spread(&normalised)) } else { Loss::Squares };
+            let loss =
+                if robust { Loss::Huber(HUBER * spread(normalised.iter().copied())) } else { Loss::Squares };
             let cost: f64 = normalised.iter().map(|r| loss.of(*r)).sum();
             let normal = self.linearise(state, active, loss).map_err(|_| failed(iteration))?;
             let covariance = self.covariance(&normal, &state.optics)?;
@@ -358,13 +326,18 @@ impl<'a> Problem<'a> {
         let chi_square_reduced = chi2 / degrees_of_freedom as f64;
 
         let mut optics = state.optics;
-        let (by_free, own_variance) = normal.mean_height();
+        let (mut by_free, mut own_variance) = normal.mean_height();
+        // d is along the axis, heights along the reference plane's normal.
+        let [tilt_x, tilt_y, _] = optics.reference.tilt_rad_xyz;
+        let slant = tilt_x.cos() * tilt_y.cos();
+        by_free.iter_mut().for_each(|by| *by /= slant);
+        own_variance /= slant * slant;
         if let Some(height) = self.settings.reference_height_mm
             && self.settings.parameters.contains(&Parameter::GratingToReference)
         {
             let sum: f64 = normal.blocks.iter().map(|b| state.positions[b.point].z).sum();
             // The points stay where they are in the world, z = s + d − h.
-            optics.grating_to_reference_mm += height - sum / points as f64;
+            optics.grating_to_reference_mm += (height - sum / points as f64) / slant;
         }
         // Rows of the estimates by the free parameters; the datum adds the points' own noise.
         let n = self.settings.parameters.len();
@@ -409,12 +382,6 @@ impl<'a> Problem<'a> {
             iterations,
         })
     }
-}
-
-/// Direction of an observed pixel but for the distortion: a start for the forward model.
-fn near(optics: &Optics, pixel: [f64; 2]) -> Option<[f64; 2]> {
-    let c = &optics.camera;
-    Some([0, 1].map(|i| (pixel[i] - c.principal_point_px[i]) / c.focal_px))
 }
 
 /// Component-wise median: one bad observation of a point does not spoil its start.

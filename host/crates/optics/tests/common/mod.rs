@@ -1,7 +1,9 @@
 //! The golden macro set-up and a ray tracer that shares no code with the crate.
 #![allow(dead_code, reason = "each test program uses its part")]
 
-use daic_optics::{Brown, Camera, Grating, Optics, PixelPair, Substrate, SubstrateSide, View};
+use daic_optics::{
+    Brown, Camera, Grating, Optics, PixelPair, ReferenceFrame, Substrate, SubstrateSide, View,
+};
 use nalgebra::{DMatrix, DVector, Rotation3, Vector2, Vector3};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -19,6 +21,7 @@ pub fn golden() -> Optics {
         grating_to_reference_mm: 109.0,
         minus: Grating::square(1.0 / 300.0),
         plus: Grating::square(1.0 / 300.0),
+        reference: Default::default(),
     }
 }
 
@@ -30,7 +33,9 @@ pub fn awkward() -> Optics {
     o.minus.substrate = Substrate { thickness_mm: 3.0, index: 1.517, side: SubstrateSide::Object };
     o.plus.tilt_rad_xyz = [-0.02, 0.05, 0.011];
     o.plus.pitch_mm *= 1.001;
+    o.plus.offset_mm = 1.7;
     o.plus.substrate = Substrate { thickness_mm: 2.0, index: 1.46, side: SubstrateSide::Camera };
+    o.reference = ReferenceFrame { tilt_rad_xyz: [0.02, -0.03, 0.15], origin_mm: [0.4, -0.7] };
     o
 }
 
@@ -53,7 +58,7 @@ pub fn trace(o: &Optics, view: View, q: [f64; 2]) -> (Vector3<f64>, Vector3<f64>
         * Rotation3::from_axis_angle(&Vector3::y_axis(), b)
         * Rotation3::from_axis_angle(&Vector3::x_axis(), a);
     let n = r * Vector3::z();
-    let pivot = Vector3::new(0.0, 0.0, o.pinhole_to_grating_mm);
+    let pivot = Vector3::new(0.0, 0.0, o.pinhole_to_grating_mm + g.offset_mm);
     let t = g.substrate.thickness_mm;
     let index = g.substrate.index;
     // The left view bends towards +x, the right one towards −x.
@@ -103,7 +108,14 @@ pub fn pixel(o: &Optics, [x, y]: [f64; 2]) -> [f64; 2] {
 
 /// Pixel that sees the object point (x, y, h): secant Newton on [`trace`].
 pub fn see(o: &Optics, view: View, p: Vector3<f64>) -> [f64; 2] {
-    let z = o.pinhole_to_grating_mm + o.grating_to_reference_mm - p.z;
+    let [a, b, c] = o.reference.tilt_rad_xyz;
+    let r = Rotation3::from_axis_angle(&Vector3::z_axis(), c)
+        * Rotation3::from_axis_angle(&Vector3::y_axis(), b)
+        * Rotation3::from_axis_angle(&Vector3::x_axis(), a);
+    let [ox, oy] = o.reference.origin_mm;
+    let p = Vector3::new(ox, oy, o.pinhole_to_grating_mm + o.grating_to_reference_mm)
+        + r * Vector3::new(p.x, p.y, -p.z);
+    let z = p.z;
     let miss = |q: [f64; 2]| {
         let (at, d) = trace(o, view, q);
         let hit = at + d * ((z - at.z) / d.z);

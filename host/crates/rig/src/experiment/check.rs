@@ -58,7 +58,30 @@ pub(super) fn optics_file(file: &OpticsFile) -> Vec<Finding> {
             format!("{:?}", OpticsFile::FORMAT),
         );
     }
+    if let Some(date) = &file.date {
+        let b = date.as_bytes();
+        let digits = |from: usize, to: usize| b[from..to].iter().all(u8::is_ascii_digit);
+        let fits =
+            b.len() >= 10 && digits(0, 4) && b[4] == b'-' && digits(5, 7) && b[7] == b'-' && digits(8, 10);
+        f.require(fits, "date", format!("{date:?}"), "a date such as \"2026-03-31\"");
+    }
     optics(&file.optics, &mut f);
+    if let Some(c) = &file.covariance {
+        let n = c.parameters.len();
+        f.require(
+            c.matrix.len() == n,
+            "covariance.matrix",
+            format!("{} rows", c.matrix.len()),
+            format!("a row for each of the {n} parameters"),
+        );
+        for (i, row) in c.matrix.iter().enumerate() {
+            let field = format!("covariance.matrix[{i}]");
+            f.require(row.len() == n, &field, format!("{} numbers", row.len()), format!("{n} numbers"));
+            if let Some(value) = row.iter().find(|v| !v.is_finite()) {
+                f.require(false, &field, value, "finite numbers");
+            }
+        }
+    }
     f.0
 }
 
@@ -165,6 +188,17 @@ fn optics(o: &Optics, f: &mut Findings) {
     if let Some(pixel) = o.pixel {
         f.positive("optics.pixel", pixel);
     }
+    if let Some(r) = o.reference {
+        for (i, tilt) in r.tilt.iter().enumerate() {
+            // About z the plate may lie in any direction.
+            let limit = if i == 2 { std::f64::consts::PI } else { std::f64::consts::FRAC_PI_4 };
+            let allowed = format!("-{limit:.4} rad to {limit:.4} rad");
+            f.require(tilt.rad().abs() <= limit, format!("optics.reference.tilt[{i}]"), tilt, allowed);
+        }
+        for (i, origin) in r.origin.iter().enumerate() {
+            f.require(origin.mm().is_finite(), format!("optics.reference.origin[{i}]"), origin, "finite");
+        }
+    }
     if let Some(b) = o.brown {
         for (name, value) in [("k1", b.k1), ("k2", b.k2), ("k3", b.k3), ("p1", b.p1), ("p2", b.p2)] {
             f.require(value.is_finite(), format!("optics.brown.{name}"), value, "a finite number");
@@ -226,6 +260,9 @@ fn grating(field: &str, g: &Grating, wavelength: Length, f: &mut Findings) {
             tilt,
             "-0.7854 rad to 0.7854 rad (45 deg)",
         );
+    }
+    if let Some(offset) = g.offset {
+        f.require(offset.mm().is_finite(), format!("{field}.offset"), offset, "a finite length");
     }
     if let Some(s) = g.substrate {
         f.require(

@@ -12,7 +12,7 @@ mod processing;
 mod rig;
 mod sequence;
 
-pub use optics::{Brown, Grating, Optics, OpticsFile, Substrate};
+pub use optics::{Brown, Covariance, Grating, Optics, OpticsFile, Reference, Side, Substrate};
 pub use problem::{ConfigError, Problem, ProblemKind};
 pub use processing::{Decoder, Interpolation, Processing, Shape};
 pub use rig::{Axes, Axis, CameraSection, CameraSource, Rig, Strobe};
@@ -82,7 +82,13 @@ impl OpticsFile {
     pub fn parse(text: &str, path: &Path) -> Result<Self, ConfigError> {
         if problem::has_key(text, "rig") {
             let experiment = Experiment::parse(text, path)?;
-            return Ok(Self { format: None, provenance: None, optics: experiment.optics });
+            return Ok(Self {
+                format: None,
+                provenance: None,
+                date: None,
+                optics: experiment.optics,
+                covariance: None,
+            });
         }
         let file: Self = problem::from_toml(text, path)?;
         problem::report(text, path, check::optics_file(&file))?;

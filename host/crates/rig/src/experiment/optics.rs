@@ -36,6 +36,20 @@ pub struct Optics {
     /// Grating of the +1 view (right on the sensor).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub grating_plus: Option<Grating>,
+    /// Where the object coordinates lie; left out, square to the optical axis with the origin on it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reference: Option<Reference>,
+}
+
+/// A reference plane that is not square to the optical axis, such as a calibration plate gives it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Reference {
+    /// Rotations about x, y, z: R = Rz·Ry·Rx about the point on the axis at h = 0.
+    #[serde(default = "no_tilt")]
+    pub tilt: [Angle; 3],
+    /// Where the origin lies beside the optical axis (x, y).
+    pub origin: [Length; 2],
 }
 
 impl Optics {
@@ -78,7 +92,10 @@ pub struct Grating {
     /// Rotations about x, y, z: R = Rz·Ry·Rx about the point where the axis meets the grating.
     #[serde(default = "no_tilt")]
     pub tilt: [Angle; 3],
-    /// Glass behind the grating (object side); left out, none.
+    /// How far it lies behind `pinhole_to_grating`; left out, not at all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub offset: Option<Length>,
+    /// Glass that carries the grooves; left out, none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub substrate: Option<Substrate>,
 }
@@ -102,6 +119,30 @@ pub struct Substrate {
     pub thickness: Length,
     /// Refractive index.
     pub index: f64,
+    /// Side of the grooves on which the glass lies; left out, `object`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub side: Option<Side>,
+}
+
+/// Side of a grating.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Side {
+    /// Towards the camera.
+    Camera,
+    /// Towards the object.
+    Object,
+}
+
+/// Covariance of calibrated values.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Covariance {
+    /// What the rows and columns are, such as `camera.focal_px` or `minus.pitch_mm`; the name ends
+    /// in the unit, angles (`tilt_rad_xyz`) are in radians.
+    pub parameters: Vec<String>,
+    /// The symmetric matrix, row by row, in these units.
+    pub matrix: Vec<Vec<f64>>,
 }
 
 /// A file that holds optics alone, such as a calibration writes it.
@@ -115,8 +156,14 @@ pub struct OpticsFile {
     /// Where the values come from, free text.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub provenance: Option<String>,
+    /// When they were found: date, or date and time (RFC 3339).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub date: Option<String>,
     /// The optics.
     pub optics: Optics,
+    /// How sure its values are, in common for all points.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub covariance: Option<Covariance>,
 }
 
 impl OpticsFile {
