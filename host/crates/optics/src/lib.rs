@@ -20,6 +20,7 @@
 //! ([`OpticalModel::project`]), displacement of a material point
 //! ([`OpticalModel::displacement`]), the expected disparity ([`OpticalModel::disparity_range`]).
 //! [`calibrate`](calibrate::calibrate) estimates parameters from points tracked through known moves.
+//! [`microscope`] holds the same for the microscope. What both are is [`PairModel`].
 
 #![allow(
     clippy::neg_cmp_op_on_partial_ord,
@@ -30,7 +31,9 @@ pub mod calibrate;
 pub mod camera;
 pub mod decode;
 pub mod grating;
+pub mod microscope;
 mod model;
+mod pair_model;
 mod project;
 mod real;
 mod setup;
@@ -40,5 +43,6 @@ pub use camera::{Brown, Camera, UndistortError};
 pub use decode::{Decoded, Decoder, Displacement, PixelPair, pixel_covariance};
 pub use grating::{DiffractError, Grating, GratingFrame, Substrate, SubstrateSide};
 pub use model::{OpticalModel, Ray, TraceError};
+pub use pair_model::PairModel;
 pub use project::DisparityRange;
 pub use setup::{Optics, OpticsError, Parameter, View};
