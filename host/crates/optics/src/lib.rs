@@ -20,7 +20,8 @@
 //! ([`OpticalModel::project`]), displacement of a material point
 //! ([`OpticalModel::displacement`]), the expected disparity ([`OpticalModel::disparity_range`]).
 //! [`calibrate`](calibrate::calibrate) estimates parameters from points tracked through known moves.
-//! [`microscope`] holds the same for the microscope. What both are is [`PairModel`].
+//! [`microscope`] holds the same for the microscope. What both are is [`PairModel`]. [`plan`](mod@plan) says what a
+//! set-up will be able to measure.
 
 #![allow(
     clippy::neg_cmp_op_on_partial_ord,
@@ -34,6 +35,7 @@ pub mod grating;
 pub mod microscope;
 mod model;
 mod pair_model;
+pub mod plan;
 mod project;
 mod real;
 mod setup;
