@@ -21,7 +21,7 @@
 //! ([`OpticalModel::displacement`]), the expected disparity ([`OpticalModel::disparity_range`]).
 //! [`calibrate`](calibrate::calibrate) estimates parameters from points tracked through known moves.
 //! [`microscope`] holds the same for the microscope. What both are is [`PairModel`]. [`plan`](mod@plan) says what a
-//! set-up will be able to measure.
+//! set-up will be able to measure; [`surface`] is the strain on a measured surface.
 
 #![allow(
     clippy::neg_cmp_op_on_partial_ord,
@@ -39,6 +39,7 @@ pub mod plan;
 mod project;
 mod real;
 mod setup;
+pub mod surface;
 
 pub use calibrate::{CalibrateError, Calibration, Estimate, Observation, Settings, TrackedPoint, calibrate};
 pub use camera::{Brown, Camera, UndistortError};
