@@ -377,6 +377,36 @@ pub fn leave_one_out(
     Ok(results)
 }
 
+/// Image residuals (u₋, v₋, u₊, v₊), observed minus model, in pixels, of every point of a motion with
+/// the fitted `parameters`; `translation_mm` as in [`MotionResult::translation_mm`]. NaN for a point
+/// that the model cannot follow.
+///
+/// # Errors
+/// If the parameters are impossible.
+pub fn residuals_px(
+    motion: &Motion,
+    parameters: &Parameters,
+    form: Form,
+    translation_mm: [f64; 3],
+) -> Result<Vec<[f64; 4]>, CalibrateError> {
+    Microscope::new(*parameters, form, [0.0; 2])?;
+    let residual = |p: &FieldPoint| {
+        let at = PixelPair { minus_px: p.middle_px, plus_px: p.middle_px };
+        let by = turned(motion, parameters, p.middle_px, p.height_mm) + Vector3::from(translation_mm);
+        let told = model_at(parameters, form, p.height_mm)?.forward(at, by).ok()?;
+        Some(std::array::from_fn(|c| p.moved_px[c] - told[c]))
+    };
+    Ok(motion.points.iter().map(|p| residual(p).unwrap_or([f64::NAN; 4])).collect())
+}
+
+/// The model in which a pair without disparity has this height.
+fn model_at(parameters: &Parameters, form: Form, height_mm: f64) -> Option<Microscope> {
+    let free = Microscope::new(*parameters, form, [0.0; 2]).ok()?;
+    let high = free.see(Vector3::new(0.0, 0.0, height_mm)).ok()?;
+    let disparity = [high.minus_px[0] - high.plus_px[0], 0.0];
+    Microscope::new(*parameters, form, disparity).ok()
+}
+
 /// Imposed displacement (mm) of a point without the motion's translation: (R − 1)(P − pivot).
 fn turned(motion: &Motion, parameters: &Parameters, middle_px: [f64; 2], height_mm: f64) -> Vector3<f64> {
     let p = parameters;
@@ -400,15 +430,12 @@ fn decoded_errors(
     form: Form,
     counts: impl Fn(usize) -> bool,
 ) -> Result<(Vec<Vector3<f64>>, [f64; 3]), CalibrateError> {
+    Microscope::new(*parameters, form, [0.0; 2])?;
     let mut errors = Vec::new();
     for (_, p) in motion.points.iter().enumerate().filter(|(i, _)| counts(*i)) {
         let decode = |source| CalibrateError::Decode { motion: motion.name.clone(), source };
         let at = PixelPair { minus_px: p.middle_px, plus_px: p.middle_px };
-        // the disparity of h = 0 follows from the height that is stated
-        let free = Microscope::new(*parameters, form, [0.0; 2])?;
-        let high = free.see(Vector3::new(0.0, 0.0, p.height_mm)).map_err(decode)?;
-        let disparity = [high.minus_px[0] - high.plus_px[0], 0.0];
-        let model = Microscope::new(*parameters, form, disparity)?;
+        let model = model_at(parameters, form, p.height_mm).ok_or(decode(TraceError::NoIntersection))?;
         let [u0, v0, u1, v1] = p.moved_px;
         let moved = PixelPair {
             minus_px: [p.middle_px[0] + u0, p.middle_px[1] + v0],
