@@ -12,6 +12,7 @@
 //!   says what such a measurement can resolve.
 //! * [`phase`]: phases of gratings and displacements from them.
 //! * [`sequence`]: the same of a series of images.
+//! * [`microscope`]: calibration of the microscope from known motions.
 
 pub mod area;
 #[cfg(feature = "sim")]
@@ -24,6 +25,7 @@ pub mod folder_camera;
 pub mod frames;
 pub mod images;
 pub mod measure;
+pub mod microscope;
 pub mod noise_floor;
 pub mod optics_section;
 pub mod pair;

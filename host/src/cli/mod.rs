@@ -1,8 +1,11 @@
 //! Flags, progress and the shape of answers.
 
 mod arguments;
+mod calibrate;
 mod commands;
+mod microscope;
 mod output;
+mod plan;
 mod strain;
 
 use arguments::{Cli, Command};
@@ -55,6 +58,8 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Phase(arguments) => commands::phase(arguments, output),
         Command::Profile(arguments) => commands::profile(arguments, output),
         Command::Displacement(arguments) => commands::displacement(arguments, output),
+        Command::Calibrate(arguments) => calibrate::calibrate(arguments, output),
+        Command::Plan(arguments) => plan::plan(arguments),
         Command::Init(arguments) => commands::init(arguments),
         Command::Schema => commands::schema(),
         Command::Doctor(arguments) => commands::doctor(arguments),
