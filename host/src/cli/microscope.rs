@@ -40,7 +40,8 @@ pub fn calibrate(arguments: &MicroscopeArgs, output: &Output) -> Result<Answer, 
     let s = &done.summary;
     let mut text = String::new();
     for v in &s.values {
-        writeln!(text, "{:<14}{:>14.6} ± {:<10.2e} {}", v.name, v.value, v.sigma, v.unit).ok();
+        let value = if v.value.abs() < 0.01 { format!("{:.5e}", v.value) } else { format!("{:.6}", v.value) };
+        writeln!(text, "{:<14}{value:>14} ± {:<10.2e} {}", v.name, v.sigma, v.unit).ok();
     }
     writeln!(
         text,
