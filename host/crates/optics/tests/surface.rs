@@ -89,8 +89,8 @@ fn stretched_cylinder() {
             if i < half || j < half || i + half >= COLUMNS || j + half >= ROWS {
                 continue;
             }
-            for c in 0..3 {
-                worst = worst.max((e.strain[c] - truth[c]).abs());
+            for (found, truth) in e.strain.iter().zip(truth) {
+                worst = worst.max((found - truth).abs());
             }
             for (found, truth) in e.principal.iter().zip(principal) {
                 worst = worst.max((found - truth).abs());
