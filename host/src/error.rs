@@ -296,6 +296,15 @@ pub enum Error {
     /// The calibration.
     #[error("the calibration failed: {0}")]
     Calibrate(#[from] daic_optics::calibrate::CalibrateError),
+    /// The calibration of a microscope.
+    #[error("the calibration failed: {0}")]
+    CalibrateMicroscope(#[from] daic_optics::microscope::calibrate::CalibrateError),
+    /// A file of motions or of a microscope.
+    #[error(transparent)]
+    MicroscopeFile(#[from] crate::microscope::MicroscopeFileError),
+    /// A plan.
+    #[error("no plan: {0}")]
+    SetUp(#[from] daic_optics::plan::PlanError),
     /// No surface where the datum of heights is.
     #[error(
         "the calibration needs the surface near the optical axis for its height datum: {found} points lie within {radius_mm} mm of it, {needed} are needed; move the specimen or the principal point"

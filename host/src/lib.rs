@@ -13,6 +13,7 @@
 //! * [`phase`]: phases of gratings and displacements from them.
 //! * [`calibrate_rig`]: points tracked on a plate become an optics file.
 //! * [`sequence`]: the same of a series of images.
+//! * [`microscope`]: calibration of the microscope from known motions.
 
 pub mod area;
 pub mod calibrate_rig;
@@ -26,6 +27,7 @@ pub mod folder_camera;
 pub mod frames;
 pub mod images;
 pub mod measure;
+pub mod microscope;
 pub mod noise_floor;
 pub mod optics_section;
 pub mod pair;

@@ -1,6 +1,7 @@
 //! Commands and their flags.
 
 use super::calibrate::CalibrateArgs;
+use super::plan::PlanArgs;
 use super::strain::{NoiseFloorArgs, ProbeArgs, StrainArgs};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
@@ -50,6 +51,10 @@ pub enum Command {
     Profile(ProfileArgs),
     /// 3D displacement from one frame with both views to another
     Displacement(DisplacementArgs),
+    /// Calibrate an instrument from measurements of something known
+    Calibrate(CalibrateArgs),
+    /// What a set-up will be able to measure: field, overlaps, uncertainty, light, and what to change
+    Plan(PlanArgs),
     /// Write a commented experiment file
     Init(InitArgs),
     /// Print the JSON schema of the experiment file

@@ -1,11 +1,11 @@
 //! `daic calibrate`.
 
-use super::commands::as_json;
-use super::output::Answer;
+use super::calibrate_rig::{self, RigArgs};
+use super::camera::{self, CameraArgs};
+use super::microscope::{self, MicroscopeArgs};
+use super::output::{Answer, Output};
 use clap::{Args, Subcommand};
-use daic::{Error, calibrate_rig};
-use std::fmt::Write as _;
-use std::path::PathBuf;
+use daic::Error;
 
 #[derive(Debug, Args)]
 pub struct CalibrateArgs {
@@ -15,81 +15,19 @@ pub struct CalibrateArgs {
 
 #[derive(Debug, Subcommand)]
 enum Calibrate {
+    /// F, principal point and distortion of a camera from images of a dot grid or checkerboard
+    Camera(CameraArgs),
     /// Camera, gratings and distances, from points of a flat plate tracked through several poses in both
     /// first-order views
     Rig(RigArgs),
+    /// β and the centre of the microscope from fields of known motions
+    Microscope(MicroscopeArgs),
 }
 
-#[derive(Debug, Args)]
-struct RigArgs {
-    /// Optics file to start from: right to some percent and degrees
-    #[arg(long, value_name = "FILE")]
-    optics: PathBuf,
-    /// Table (CSV) of tracked points: pose, point, plate_x_mm, plate_y_mm, minus_x, minus_y, plus_x, plus_y and
-    /// perhaps sigma_px; cells may be empty
-    points: PathBuf,
-    /// Table (CSV) of known moves against the reference pose: pose, x_mm, y_mm, h_mm; cells may be empty
-    #[arg(long, value_name = "FILE")]
-    moves: Option<PathBuf>,
-    /// Standard deviation of a known move
-    #[arg(long, value_name = "MM", default_value_t = 0.001, value_parser = positive)]
-    move_sigma: f64,
-    /// Standard deviation of a pixel where the table states none
-    #[arg(long, value_name = "PX", default_value_t = 0.02, value_parser = positive)]
-    sigma: f64,
-    /// Pose that becomes the reference plane (default: the first)
-    #[arg(long, value_name = "POSE")]
-    reference: Option<i64>,
-    /// Folder for optics.toml and the report
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
-}
-
-fn positive(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(v) if v > 0.0 && v.is_finite() => Ok(v),
-        _ => Err(format!("found `{text}`, wanted a number above 0")),
-    }
-}
-
-pub fn calibrate(arguments: &CalibrateArgs) -> Result<Answer, Error> {
+pub fn calibrate(arguments: &CalibrateArgs, output: &Output) -> Result<Answer, Error> {
     match &arguments.what {
-        Calibrate::Rig(arguments) => rig(arguments),
+        Calibrate::Camera(arguments) => camera::calibrate(arguments, output),
+        Calibrate::Rig(arguments) => calibrate_rig::calibrate(arguments),
+        Calibrate::Microscope(arguments) => microscope::calibrate(arguments, output),
     }
-}
-
-fn rig(arguments: &RigArgs) -> Result<Answer, Error> {
-    let options = calibrate_rig::Options {
-        optics: arguments.optics.clone(),
-        points: arguments.points.clone(),
-        moves: arguments.moves.clone(),
-        move_sigma_mm: arguments.move_sigma,
-        sigma_px: arguments.sigma,
-        reference: arguments.reference,
-        out: arguments.out.clone(),
-    };
-    let summary = calibrate_rig::run(&options)?;
-    let mut text = String::new();
-    for p in &summary.parameters {
-        writeln!(text, "{:<32}{:>18.7} ± {:.7}", p.name, p.value, p.sigma).ok();
-    }
-    writeln!(
-        text,
-        "residual {:.4} px RMS, χ² {:.3} per degree of freedom, {} pixels left out",
-        summary.rms_px, summary.chi_square_reduced, summary.rejected
-    )
-    .ok();
-    for combination in &summary.left_to_priors {
-        writeln!(text, "left to priors: {combination}").ok();
-    }
-    for l in &summary.left_out {
-        writeln!(
-            text,
-            "pose {} predicted without itself: h to {:.2} µm RMS, noise {:.2} µm",
-            l.pose, l.rms_h_um, l.expected_h_um
-        )
-        .ok();
-    }
-    write!(text, "optics: {}", summary.optics.display()).ok();
-    Ok(Answer::new(as_json(&summary)?, text))
 }

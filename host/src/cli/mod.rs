@@ -2,8 +2,11 @@
 
 mod arguments;
 mod calibrate;
+mod calibrate_rig;
 mod commands;
+mod microscope;
 mod output;
+mod plan;
 mod strain;
 
 use arguments::{Cli, Command};
@@ -53,10 +56,11 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Strain(arguments) => strain::strain(arguments, output),
         Command::Probe(arguments) => strain::probe(arguments),
         Command::NoiseFloor(arguments) => strain::noise_floor(arguments, output),
-        Command::Calibrate(arguments) => calibrate::calibrate(arguments),
         Command::Phase(arguments) => commands::phase(arguments, output),
         Command::Profile(arguments) => commands::profile(arguments, output),
         Command::Displacement(arguments) => commands::displacement(arguments, output),
+        Command::Calibrate(arguments) => calibrate::calibrate(arguments, output),
+        Command::Plan(arguments) => plan::plan(arguments),
         Command::Init(arguments) => commands::init(arguments),
         Command::Schema => commands::schema(),
         Command::Doctor(arguments) => commands::doctor(arguments),

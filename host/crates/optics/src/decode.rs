@@ -45,7 +45,7 @@ impl PixelPair {
         }
     }
 
-    fn coordinates(&self) -> [f64; 4] {
+    pub(crate) fn coordinates(&self) -> [f64; 4] {
         let ([a, b], [c, d]) = (self.minus_px, self.plus_px);
         [a, b, c, d]
     }
@@ -106,6 +106,26 @@ pub struct Displacement {
     pub displacement_mm: Vector3<f64>,
     /// Its covariance in mm², from the pixels alone.
     pub covariance_mm2: Matrix3<f64>,
+}
+
+impl Displacement {
+    /// Difference of two decoded points, and its covariance: an error of the reference pair moves
+    /// both points and all but cancels, those of the increments (`tracking_px2`) do not.
+    pub(crate) fn between(
+        reference: Decoded,
+        deformed: Decoded,
+        reference_px2: &Matrix4<f64>,
+        tracking_px2: &Matrix4<f64>,
+    ) -> Self {
+        let common = deformed.jacobian - reference.jacobian;
+        Self {
+            reference,
+            deformed,
+            displacement_mm: deformed.point_mm - reference.point_mm,
+            covariance_mm2: common * reference_px2 * common.transpose()
+                + deformed.covariance_mm2(tracking_px2),
+        }
+    }
 }
 
 impl OpticalModel {
@@ -190,14 +210,7 @@ impl OpticalModel {
     ) -> Result<Displacement, TraceError> {
         let reference = self.decode(decoder, reference)?;
         let deformed = self.decode(decoder, deformed)?;
-        let common = deformed.jacobian - reference.jacobian;
-        Ok(Displacement {
-            reference,
-            deformed,
-            displacement_mm: deformed.point_mm - reference.point_mm,
-            covariance_mm2: common * reference_px2 * common.transpose()
-                + deformed.covariance_mm2(tracking_px2),
-        })
+        Ok(Displacement::between(reference, deformed, reference_px2, tracking_px2))
     }
 }
 

@@ -23,6 +23,8 @@
 //! Dense distortion maps ([`maps`]) may stand in for the camera's Brown terms or on top of them.
 //! [`calibrate`](calibrate::calibrate) estimates F and the distances from points tracked through
 //! known moves, [`bundle`] everything from views of a plate in several poses.
+//! [`microscope`] holds the same for the microscope. What both are is [`PairModel`]. [`plan`](mod@plan) says what a
+//! set-up will be able to measure; [`surface`] is the strain on a measured surface.
 
 #![allow(
     clippy::neg_cmp_op_on_partial_ord,
@@ -36,12 +38,16 @@ pub mod camera;
 pub mod decode;
 pub mod grating;
 pub mod maps;
+pub mod microscope;
 mod model;
+mod pair_model;
 pub mod parameter;
+pub mod plan;
 mod project;
 mod real;
 mod robust;
 mod setup;
+pub mod surface;
 
 pub use bundle::{Component, RigCalibration, RigData, RigError, RigSettings, calibrate_rig};
 pub use calibrate::{CalibrateError, Calibration, Estimate, Observation, Settings, TrackedPoint, calibrate};
@@ -53,5 +59,6 @@ pub use model::{OpticalModel, Ray, TraceError};
 pub use parameter::{
     CovarianceError, GratingParameter, Parameter, ParameterCovariance, ParameterJacobian, UnknownParameter,
 };
+pub use pair_model::PairModel;
 pub use project::DisparityRange;
 pub use setup::{Optics, OpticsError, ReferenceFrame, View};

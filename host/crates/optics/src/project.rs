@@ -4,6 +4,7 @@
 //! line of sight; lens distortion is applied afterwards and costs no iteration.
 
 use nalgebra::{Matrix2x3, SMatrix, Vector3};
+use serde::{Deserialize, Serialize};
 
 use crate::model::{OpticalModel, Setup, TraceError};
 use crate::parameter::ParameterJacobian;
@@ -11,7 +12,7 @@ use crate::real::{Dual, Real, solve2};
 use crate::setup::{Optics, View};
 
 /// Range of the displacement from the −1 to the +1 view over a range of heights, in pixels.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DisparityRange {
     /// Smallest and largest u = x₊ − x₋.
     pub u_px: [f64; 2],
