@@ -11,9 +11,13 @@
 //! * [`pair`]: plain 2D-DIC of two images; [`strain`] and [`probe`] work on its results, [`noise_floor`]
 //!   says what such a measurement can resolve.
 //! * [`phase`]: phases of gratings and displacements from them.
+//! * [`calibrate_camera`]: a camera from images of a board; [`align`]: lining up a rig.
 //! * [`sequence`]: the same of a series of images.
 
+pub mod align;
 pub mod area;
+pub mod calibrate_camera;
+pub mod camera_file;
 #[cfg(feature = "sim")]
 pub mod demo;
 pub mod doctor;

@@ -1,5 +1,6 @@
 //! Commands and their flags.
 
+use super::calibrate::{AlignArgs, CalibrateCommand};
 use super::strain::{NoiseFloorArgs, ProbeArgs, StrainArgs};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
@@ -47,6 +48,11 @@ pub enum Command {
     Profile(ProfileArgs),
     /// 3D displacement from one frame with both views to another
     Displacement(DisplacementArgs),
+    /// Calibrate a part of the optics from images
+    #[command(subcommand)]
+    Calibrate(CalibrateCommand),
+    /// Line up camera, laser and gratings, step by step, from stored images
+    Align(AlignArgs),
     /// Write a commented experiment file
     Init(InitArgs),
     /// Print the JSON schema of the experiment file

@@ -1,6 +1,7 @@
 //! Flags, progress and the shape of answers.
 
 mod arguments;
+mod calibrate;
 mod commands;
 mod output;
 mod strain;
@@ -55,6 +56,8 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Phase(arguments) => commands::phase(arguments, output),
         Command::Profile(arguments) => commands::profile(arguments, output),
         Command::Displacement(arguments) => commands::displacement(arguments, output),
+        Command::Calibrate(command) => calibrate::calibrate(command, output),
+        Command::Align(arguments) => calibrate::align(arguments),
         Command::Init(arguments) => commands::init(arguments),
         Command::Schema => commands::schema(),
         Command::Doctor(arguments) => commands::doctor(arguments),

@@ -19,13 +19,15 @@
 //! work: decoding a pixel pair ([`OpticalModel::decode`]), projecting a point
 //! ([`OpticalModel::project`]), displacement of a material point
 //! ([`OpticalModel::displacement`]), the expected disparity ([`OpticalModel::disparity_range`]).
-//! [`calibrate`](calibrate::calibrate) estimates parameters from points tracked through known moves.
+//! [`target`] finds calibration boards in images, [`intrinsics`] calibrates a camera from them,
+//! [`align`] helps to line up a rig. [`calibrate`](calibrate::calibrate) estimates parameters from points tracked through known moves.
 
 #![allow(
     clippy::neg_cmp_op_on_partial_ord,
     reason = "!(a > b) is written where a NaN must be refused as well"
 )]
 
+pub mod align;
 pub mod calibrate;
 pub mod camera;
 pub mod decode;
