@@ -8,6 +8,7 @@ use crate::camera_file::{self, CameraFile};
 use crate::error::Error;
 use crate::images;
 use daic_dataset::{GreyImage, atomic};
+use daic_optics::GreyView;
 use daic_optics::align::axis::{Axis, Offset, axis, grating_tilt, offset};
 use daic_optics::align::distance::{pinhole_to_grating, pinhole_to_line};
 use daic_optics::align::orders::{OrderLine, order_line};
@@ -15,7 +16,6 @@ use daic_optics::align::spots::{Spot, find_disc, find_spots};
 use daic_optics::align::{AlignError, Measured};
 use daic_optics::intrinsics::{CameraParameter, pose_of_board};
 use daic_optics::target::{Pattern, TargetSettings};
-use daic_optics::GreyView;
 use daic_rig::experiment::{self, OpticsFile};
 use daic_rig::units::{Length, Pixels};
 use serde::Serialize;
@@ -76,7 +76,10 @@ fn at(path: &Path) -> impl Fn(AlignError) -> Error + '_ {
     move |source| Error::Align { path: path.to_owned(), source }
 }
 
-fn with_view<T>(path: &Path, look: impl FnOnce(&GreyImage, &GreyView<'_>) -> Result<T, AlignError>) -> Result<T, Error> {
+fn with_view<T>(
+    path: &Path,
+    look: impl FnOnce(&GreyImage, &GreyView<'_>) -> Result<T, AlignError>,
+) -> Result<T, Error> {
     let image = images::read(path)?;
     let data = grey(&image);
     let view = GreyView::new(&data, image.width as usize, image.height as usize)
@@ -154,7 +157,14 @@ pub fn rail(
         // The camera's axis is to go where the rail goes.
         Mark::Aperture => ["turn the camera to its", "right", "left", "tilt the camera", "down", "up"],
         // The beam, seen from the camera, comes from the side to which it slopes.
-        Mark::Laser => ["turn the laser, seen from the camera, so that far away the beam moves to the", "left", "right", "tilt the laser so that far away the beam moves", "up", "down"],
+        Mark::Laser => [
+            "turn the laser, seen from the camera, so that far away the beam moves to the",
+            "left",
+            "right",
+            "tilt the laser so that far away the beam moves",
+            "up",
+            "down",
+        ],
     };
     if let Some(way) = either(sx, turn[1], turn[2]) {
         advice.push(format!("{} {way} by {}", turn[0], say(sx, 1e3, "mrad")));
@@ -222,7 +232,12 @@ pub struct Orders {
 ///
 /// # Errors
 /// Not three spots, or not those of three orders.
-pub fn orders(camera: &CameraFile, image: &Path, other: Option<&Path>, shift: Option<f64>) -> Result<Step<Orders>, Error> {
+pub fn orders(
+    camera: &CameraFile,
+    image: &Path,
+    other: Option<&Path>,
+    shift: Option<f64>,
+) -> Result<Step<Orders>, Error> {
     let line = |path: &Path| order_line(&camera.camera, &spots(path, 3)?).map_err(at(path));
     let first = line(image)?;
     let tilt_x_rad = shift.map(|s| first.tilt_x_rad(&camera.camera, s)).transpose().map_err(at(image))?;
@@ -232,11 +247,16 @@ pub fn orders(camera: &CameraFile, image: &Path, other: Option<&Path>, shift: Op
     if first.bow_px.stands_out(4.0) {
         let tilt = tilt_x_rad.map_or_else(String::new, |t| format!(": about x by {}", say(t, 1e3, "mrad")));
         let px = say(first.bow_px, 1.0, "px");
-        advice.push(format!("the spots are not on a line ({px}): the grating is tilted{tilt}; repeat step reflection"));
+        advice.push(format!(
+            "the spots are not on a line ({px}): the grating is tilted{tilt}; repeat step reflection"
+        ));
     }
     if let Some(relative) = relative_rad.filter(|r| r.stands_out(NOTHING)) {
-        advice.push(format!("the second grating is turned against the first by {}{}: seat it anew in its groove",
-            if relative.value > 0.0 { '+' } else { '−' }, say(relative, 1e3, "mrad")));
+        advice.push(format!(
+            "the second grating is turned against the first by {}{}: seat it anew in its groove",
+            if relative.value > 0.0 { '+' } else { '−' },
+            say(relative, 1e3, "mrad")
+        ));
     }
     let images: Vec<&Path> = [Some(image), other].into_iter().flatten().collect();
     Ok(Step::new("orders", &images, advice, Orders { first, tilt_x_rad, second, relative_rad }))
@@ -293,7 +313,8 @@ pub fn distance(camera: &CameraFile, image: &Path, options: &BoardOptions) -> Re
     let [d, s] = fit.axial_distance_mm();
     let scale = (focal.sigma / focal.value).hypot(pitch.sigma / pitch.value);
     let board_mm = Measured::new(d, s.hypot(d * scale));
-    let pinhole_to_grating_mm = pinhole_to_grating(board_mm, options.grating_to_board_mm).map_err(at(image))?;
+    let pinhole_to_grating_mm =
+        pinhole_to_grating(board_mm, options.grating_to_board_mm).map_err(at(image))?;
     let tilt_deg = fit.pose.tilt_rad().to_degrees();
     let mut advice = Vec::new();
     // 1 − cos of it is what D = L F/L′ is wrong by.
@@ -336,7 +357,12 @@ pub fn record<T: Serialize>(path: &Path, step: &Step<T>) -> Result<(), Error> {
 ///
 /// # Errors
 /// A file that cannot be read or written.
-pub fn write_optics(from: &Path, to: &Path, camera: &CameraFile, found: &Step<Distance>) -> Result<PathBuf, Error> {
+pub fn write_optics(
+    from: &Path,
+    to: &Path,
+    camera: &CameraFile,
+    found: &Step<Distance>,
+) -> Result<PathBuf, Error> {
     let mut file = OpticsFile::load(from)?;
     let b = camera.camera.brown;
     let brown = experiment::Brown { k1: b.k1, k2: b.k2, k3: b.k3, p1: b.p1, p2: b.p2 };

@@ -6,10 +6,13 @@ use crate::images;
 use crate::progress::Progress;
 use daic_dataset::{GreyImage, atomic};
 use daic_optics::GreyView;
-use daic_optics::intrinsics::{BoardPoint, CameraCalibration, CameraParameter, CameraSettings, calibrate_camera};
+use daic_optics::intrinsics::{
+    BoardPoint, CameraCalibration, CameraParameter, CameraSettings, calibrate_camera,
+};
 use daic_optics::target::{Pattern, Target, TargetSettings, find_target};
 use daic_report::{
-    Cell, Chart, Figure, Mark, Overlay, Report, Section, Series, SeriesStyle, TableBlock, plain, with_uncertainty,
+    Cell, Chart, Figure, Mark, Overlay, Report, Section, Series, SeriesStyle, TableBlock, plain,
+    with_uncertainty,
 };
 use std::path::{Path, PathBuf};
 
@@ -153,9 +156,10 @@ impl Run {
         let mut figures = vec![Figure {
             id: "residuals".to_owned(),
             title: "Residuals".to_owned(),
-            caption: "Observed minus model of every point, a colour for each view; without structure they form \
+            caption:
+                "Observed minus model of every point, a colour for each view; without structure they form \
                       one round cloud."
-                .to_owned(),
+                    .to_owned(),
             body: self.residuals().render_svg()?,
         }];
         for (k, name) in self.file.views.iter().enumerate() {

@@ -103,8 +103,7 @@ impl CameraFile {
         board: Board,
     ) -> Self {
         let n = calibration.estimates.len();
-        let covariance =
-            (0..n).map(|i| (0..n).map(|j| calibration.covariance[(i, j)]).collect()).collect();
+        let covariance = (0..n).map(|i| (0..n).map(|j| calibration.covariance[(i, j)]).collect()).collect();
         let views = calibration
             .views
             .iter()
@@ -140,8 +139,8 @@ impl CameraFile {
     /// # Errors
     /// [`Error::CameraFile`] names the line or the field.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|source| Error::Read { path: path.to_owned(), source })?;
+        let text =
+            std::fs::read_to_string(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
         let bad = |reason: String| Error::CameraFile { path: path.to_owned(), reason };
         let file: Self = toml::from_str(&text).map_err(|e| bad(e.to_string()))?;
         if file.format != Self::FORMAT {
@@ -157,7 +156,9 @@ impl CameraFile {
         }
         let n = file.estimates.len();
         if file.covariance.len() != n || file.covariance.iter().any(|row| row.len() != n) {
-            return Err(bad(format!("field covariance must have {n} rows of {n} numbers, as there are estimates")));
+            return Err(bad(format!(
+                "field covariance must have {n} rows of {n} numbers, as there are estimates"
+            )));
         }
         if let Some(e) = file.estimates.iter().find(|e| !(e.sigma >= 0.0 && e.value.is_finite())) {
             return Err(bad(format!("field estimates: {} has no valid value and sigma", e.parameter.name())));

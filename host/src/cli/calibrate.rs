@@ -98,7 +98,8 @@ fn positive(text: &str) -> Result<f64, String> {
 /// `VALUE` or `VALUE,SIGMA`.
 fn measured(text: &str) -> Result<Measured, String> {
     let (value, sigma) = text.split_once(',').unwrap_or((text, "0"));
-    let sigma: f64 = sigma.trim().parse().map_err(|_| format!("found `{text}`, wanted VALUE or VALUE,SIGMA"))?;
+    let sigma: f64 =
+        sigma.trim().parse().map_err(|_| format!("found `{text}`, wanted VALUE or VALUE,SIGMA"))?;
     if !(sigma >= 0.0 && sigma.is_finite()) {
         return Err(format!("the standard deviation is {sigma}, it must be 0 or above"));
     }
@@ -156,7 +157,8 @@ fn camera(arguments: &CameraArgs, output: &Output) -> Result<Answer, Error> {
         text.push_str("the points do not fit the model within their noise: a board that is not plane, a lens that Brown's terms do not describe, or --fix of a parameter that matters\n");
     }
     let mut answer = as_json(f)?;
-    let skipped = run.skipped.iter().map(|(p, why)| json!({ "image": p.display().to_string(), "reason": why }));
+    let skipped =
+        run.skipped.iter().map(|(p, why)| json!({ "image": p.display().to_string(), "reason": why }));
     answer["skipped"] = skipped.collect();
     if let Some(folder) = &arguments.out {
         writeln!(text, "report: {}", folder.join("report.html").display()).ok();
@@ -255,7 +257,8 @@ pub fn align(arguments: &AlignArgs) -> Result<Answer, Error> {
     let px = |m: &Measured| daic_report::with_uncertainty(m.value, m.sigma, "px");
     match &arguments.step {
         AlignStep::Rail(a) | AlignStep::Laser(a) => {
-            let mark = if matches!(arguments.step, AlignStep::Rail(_)) { Mark::Aperture } else { Mark::Laser };
+            let mark =
+                if matches!(arguments.step, AlignStep::Rail(_)) { Mark::Aperture } else { Mark::Laser };
             let step = align::rail(&camera, mark, &a.near, a.far.as_deref(), a.distances.map(|d| d.0))?;
             let mut text = String::new();
             for (m, image) in step.found.marks.iter().zip(&step.images) {
@@ -283,7 +286,11 @@ pub fn align(arguments: &AlignArgs) -> Result<Answer, Error> {
         AlignStep::Orders(a) => {
             let step = align::orders(&camera, &a.image, a.other.as_deref(), a.wavelength_over_pitch)?;
             let f = &step.found;
-            let mut text = format!("orders at {} to the x axis, bow {}\n", mrad(&f.first.angle_rad), px(&f.first.bow_px));
+            let mut text = format!(
+                "orders at {} to the x axis, bow {}\n",
+                mrad(&f.first.angle_rad),
+                px(&f.first.bow_px)
+            );
             if let Some(relative) = &f.relative_rad {
                 writeln!(text, "second grating against the first {}", mrad(relative)).ok();
             }

@@ -45,6 +45,6 @@ pub use camera::{Brown, Camera, UndistortError};
 pub use decode::{Decoded, Decoder, Displacement, PixelPair, pixel_covariance};
 pub use grating::{DiffractError, Grating, GratingFrame, Substrate, SubstrateSide};
 pub use model::{OpticalModel, Ray, TraceError};
-pub use project::DisparityRange;
 pub use patch::{GreyError, GreyView};
+pub use project::DisparityRange;
 pub use setup::{Optics, OpticsError, Parameter, View};

@@ -16,7 +16,11 @@ const W: usize = 800;
 const H: usize = 600;
 
 fn camera() -> Camera {
-    Camera { focal_px: 1400.0, principal_point_px: [405.0, 294.0], brown: Brown { k1: -0.1, ..Brown::default() } }
+    Camera {
+        focal_px: 1400.0,
+        principal_point_px: [405.0, 294.0],
+        brown: Brown { k1: -0.1, ..Brown::default() },
+    }
 }
 
 fn empty(level: impl Fn(f64, f64) -> f64) -> Image {
@@ -119,7 +123,10 @@ fn discs_bright_and_dark() {
 fn nothing_to_see_is_an_error() {
     let image = empty(|_, _| 100.0).recorded(3.0, 255.0, 9);
     assert!(matches!(find_disc(&view(&image)), Err(AlignError::NoDisc)));
-    assert!(matches!(find_spots(&view(&image), 3, 255.0), Err(AlignError::Spots { .. } | AlignError::Unfit { .. })));
+    assert!(matches!(
+        find_spots(&view(&image), 3, 255.0),
+        Err(AlignError::Spots { .. } | AlignError::Unfit { .. })
+    ));
     let mut two = empty(|_, _| 20.0);
     add_spot(&mut two, [200.0, 300.0], 100.0, [4.0, 4.0]);
     add_spot(&mut two, [400.0, 300.0], 100.0, [4.0, 4.0]);
@@ -236,11 +243,16 @@ fn distance_from_a_board() {
     let end = |i: i32| target.points.iter().find(|p| p.index == [i, 5]).unwrap();
     let [a, b] = [end(0), end(14)].map(|p| c.undistort_px(p.at_px).unwrap());
     let length = (a[0] - b[0]).hypot(a[1] - b[1]);
-    let line = pinhole_to_line(Measured::new(1400.0, 0.7), Measured::new(84.0, 0.01), Measured::new(length, 0.02)).unwrap();
+    let line =
+        pinhole_to_line(Measured::new(1400.0, 0.7), Measured::new(84.0, 0.01), Measured::new(length, 0.02))
+            .unwrap();
     close(line, 210.0, "D = L F/L′");
     assert!((line.sigma / line.value - 5.2e-4).abs() < 1e-4);
     let grating = pinhole_to_grating(board, Measured::new(109.0, 0.05)).unwrap();
     assert!((grating.value - (d - 109.0)).abs() < 1e-12 && grating.sigma > 0.05);
     assert!(pinhole_to_grating(board, Measured::new(300.0, 0.05)).is_err());
-    assert!(pinhole_to_line(Measured::new(f64::NAN, 0.0), Measured::new(1.0, 0.0), Measured::new(1.0, 0.0)).is_err());
+    assert!(
+        pinhole_to_line(Measured::new(f64::NAN, 0.0), Measured::new(1.0, 0.0), Measured::new(1.0, 0.0))
+            .is_err()
+    );
 }

@@ -108,7 +108,11 @@ fn standard_deviations_cover_the_truth() {
 #[test]
 fn a_long_lens_and_few_pixels_of_distortion_start_from_nothing() {
     // The macro set-up: field of ±4°, strong correlation of F and distance.
-    let c = Camera { focal_px: 17347.0, principal_point_px: [1320.0, 950.0], brown: Brown { k1: -0.3, ..Brown::default() } };
+    let c = Camera {
+        focal_px: 17347.0,
+        principal_point_px: [1320.0, 950.0],
+        brown: Brown { k1: -0.3, ..Brown::default() },
+    };
     let mut random = Noise::new(3);
     let views: Vec<_> = (0..8)
         .map(|k| {
@@ -119,7 +123,8 @@ fn a_long_lens_and_few_pixels_of_distortion_start_from_nothing() {
         })
         .collect();
     use CameraParameter::{Focal, K1, PrincipalX, PrincipalY};
-    let settings = CameraSettings { free: vec![Focal, PrincipalX, PrincipalY, K1], ..CameraSettings::new([2592, 1944]) };
+    let settings =
+        CameraSettings { free: vec![Focal, PrincipalX, PrincipalY, K1], ..CameraSettings::new([2592, 1944]) };
     let found = calibrate_camera(&views, &settings).unwrap();
     for e in &found.estimates {
         println!("{:?} {} ± {}", e.parameter, e.value, e.sigma);

@@ -25,9 +25,8 @@ pub struct Offset {
 /// A pixel that the distortion model cannot invert.
 pub fn offset(camera: &Camera, principal_sigma_px: [f64; 2], mark: &Spot) -> Result<Offset, AlignError> {
     let q = camera.direction(mark.at_px)?;
-    let offset_px = [0, 1].map(|l| {
-        Measured::new(q[l] * camera.focal_px, mark.sigma_px[l].hypot(principal_sigma_px[l]))
-    });
+    let offset_px =
+        [0, 1].map(|l| Measured::new(q[l] * camera.focal_px, mark.sigma_px[l].hypot(principal_sigma_px[l])));
     let angle_rad = offset_px.map(|o| Measured::new(o.value / camera.focal_px, o.sigma / camera.focal_px));
     Ok(Offset { offset_px, angle_rad })
 }

@@ -40,7 +40,9 @@ impl Measured {
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum AlignError {
     /// Not as many spots as the step needs.
-    #[error("{found} spots were found, {needed} are needed; is the picture overexposed, or does a reflection hide one?")]
+    #[error(
+        "{found} spots were found, {needed} are needed; is the picture overexposed, or does a reflection hide one?"
+    )]
     Spots {
         /// Found.
         found: usize,
@@ -51,7 +53,9 @@ pub enum AlignError {
     #[error("no bright or dark disc at least 6 pixels wide stands out of the picture")]
     NoDisc,
     /// The model did not fit a spot.
-    #[error("the spot near ({x:.0}, {y:.0}) cannot be measured: it is cut off, saturated to its rim or no single spot")]
+    #[error(
+        "the spot near ({x:.0}, {y:.0}) cannot be measured: it is cut off, saturated to its rim or no single spot"
+    )]
     Unfit {
         /// Column.
         x: f64,
@@ -69,7 +73,9 @@ pub enum AlignError {
         allowed: &'static str,
     },
     /// Outer spots that do not belong to orders −1 and +1 of one grating.
-    #[error("the outer spots lie {left:.1} and {right:.1} px from the middle one: these are not orders −1, 0 and +1 of one beam")]
+    #[error(
+        "the outer spots lie {left:.1} and {right:.1} px from the middle one: these are not orders −1, 0 and +1 of one beam"
+    )]
     NotOrders {
         /// From the middle to the left.
         left: f64,

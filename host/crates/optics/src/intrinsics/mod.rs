@@ -54,16 +54,8 @@ pub enum CameraParameter {
 
 impl CameraParameter {
     /// All of them.
-    pub const ALL: [Self; 8] = [
-        Self::Focal,
-        Self::PrincipalX,
-        Self::PrincipalY,
-        Self::K1,
-        Self::K2,
-        Self::K3,
-        Self::P1,
-        Self::P2,
-    ];
+    pub const ALL: [Self; 8] =
+        [Self::Focal, Self::PrincipalX, Self::PrincipalY, Self::K1, Self::K2, Self::K3, Self::P1, Self::P2];
 
     /// As in files.
     pub fn name(self) -> &'static str {
@@ -285,7 +277,9 @@ pub enum CameraError {
         parameters: usize,
     },
     /// The points of a view lie on a line, or are less than four.
-    #[error("view {view}: its {points} points do not fix the position of a board (fewer than 4, or on a line)")]
+    #[error(
+        "view {view}: its {points} points do not fix the position of a board (fewer than 4, or on a line)"
+    )]
     DegenerateView {
         /// The view, from 0.
         view: usize,
@@ -293,7 +287,9 @@ pub enum CameraError {
         points: usize,
     },
     /// A number that is not finite, or a standard deviation that is not above zero.
-    #[error("view {view}, point {point}: coordinates and standard deviations must be finite, the latter above 0")]
+    #[error(
+        "view {view}, point {point}: coordinates and standard deviations must be finite, the latter above 0"
+    )]
     Value {
         /// The view, from 0.
         view: usize,
@@ -330,7 +326,9 @@ pub enum CameraError {
         allowed: &'static str,
     },
     /// Too many points disagree with the model.
-    #[error("{rejected} of {points} points disagree with the model, at most {limit} may: wrong indices, another board, or a lens that Brown's model does not describe")]
+    #[error(
+        "{rejected} of {points} points disagree with the model, at most {limit} may: wrong indices, another board, or a lens that Brown's model does not describe"
+    )]
     TooManyOutliers {
         /// Left out.
         rejected: usize,
@@ -340,7 +338,9 @@ pub enum CameraError {
         limit: usize,
     },
     /// The adjustment did not come to rest.
-    #[error("no convergence in {iterations} iterations: the views do not show one plane board with a fixed camera")]
+    #[error(
+        "no convergence in {iterations} iterations: the views do not show one plane board with a fixed camera"
+    )]
     NotConverged {
         /// Iterations made.
         iterations: usize,
@@ -365,8 +365,7 @@ pub fn calibrate_camera(
 /// [`CameraError::DegenerateView`], [`CameraError::Value`], [`CameraError::NotConverged`]; the view is 0.
 pub fn pose_of_board(camera: &Camera, points: &[BoardPoint]) -> Result<PoseFit, CameraError> {
     let views = [points.to_vec()];
-    let settings =
-        CameraSettings { free: Vec::new(), start: Some(*camera), ..CameraSettings::new([1, 1]) };
+    let settings = CameraSettings { free: Vec::new(), start: Some(*camera), ..CameraSettings::new([1, 1]) };
     check(&views, &settings)?;
     solve::pose(camera, &views, &settings)
 }
@@ -384,7 +383,8 @@ fn check(views: &[Vec<BoardPoint>], s: &CameraSettings) -> Result<(), CameraErro
     {
         return setting("start", "F must be above 0, all values finite");
     }
-    if !(s.outlier_limit > 0.0 && s.max_relative_sigma > 0.0 && (0.0..1.0).contains(&s.max_outlier_fraction)) {
+    if !(s.outlier_limit > 0.0 && s.max_relative_sigma > 0.0 && (0.0..1.0).contains(&s.max_outlier_fraction))
+    {
         return setting("limits", "limits must be above 0, the fraction of outliers in 0 to 1");
     }
     // Each view has two conditions for F and the principal point.

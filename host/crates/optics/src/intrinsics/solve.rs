@@ -4,8 +4,8 @@ use nalgebra::{DMatrix, Matrix2x3, Matrix3, Matrix6, Rotation3, SMatrix, SVector
 
 use super::start;
 use super::{
-    BoardPoint, CameraCalibration, CameraError, CameraEstimate, CameraParameter, CameraSettings, Pose, PoseFit,
-    ViewFit,
+    BoardPoint, CameraCalibration, CameraError, CameraEstimate, CameraParameter, CameraSettings, Pose,
+    PoseFit, ViewFit,
 };
 use crate::camera::{Camera, distort_jacobian};
 
@@ -190,7 +190,8 @@ impl Problem<'_> {
 
     /// Marks points beyond the limit; whether something changed.
     fn select(&mut self, state: &State, limit: f64) -> bool {
-        let size = |p: &BoardPoint, r: [f64; 2]| (r[0] / p.sigma_px[0]).abs().max((r[1] / p.sigma_px[1]).abs());
+        let size =
+            |p: &BoardPoint, r: [f64; 2]| (r[0] / p.sigma_px[0]).abs().max((r[1] / p.sigma_px[1]).abs());
         let residuals = self.residuals(state);
         let mut all: Vec<f64> = Vec::new();
         for (points, rs) in self.views.iter().zip(&residuals) {
@@ -365,10 +366,9 @@ fn finish(
     let chi_square_reduced = normal.cost / degrees_of_freedom as f64;
     let limit = settings.max_relative_sigma * state.camera.focal_px;
     let undetermined = |parameter, sigma| CameraError::Undetermined { parameter, sigma, limit };
-    let full = normal
-        .covariance(&problem.free)
-        .map_err(|k| undetermined(CameraParameter::ALL[k], f64::INFINITY))?
-        * chi_square_reduced.max(1.0);
+    let full =
+        normal.covariance(&problem.free).map_err(|k| undetermined(CameraParameter::ALL[k], f64::INFINITY))?
+            * chi_square_reduced.max(1.0);
     let position = |p: CameraParameter| CameraParameter::ALL.iter().position(|q| *q == p).unwrap_or(0);
     let covariance = DMatrix::from_fn(settings.free.len(), settings.free.len(), |i, j| {
         full[(position(settings.free[i]), position(settings.free[j]))]
@@ -439,8 +439,7 @@ pub(super) fn pose(
     let normal = problem.linearise(&state).ok_or(failed.clone())?;
     let coordinates = 2 * views[0].len();
     let freedom = coordinates.saturating_sub(6).max(1) as f64;
-    let covariance =
-        normal.views[0].0.cholesky().ok_or(failed)?.inverse() * (normal.cost / freedom).max(1.0);
+    let covariance = normal.views[0].0.cholesky().ok_or(failed)?.inverse() * (normal.cost / freedom).max(1.0);
     let square: f64 = problem.residuals(&state)[0].iter().flatten().map(|r| r * r).sum();
     Ok(PoseFit { pose: state.poses[0], covariance, rms_px: (square / coordinates as f64).sqrt() })
 }

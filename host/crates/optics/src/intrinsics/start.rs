@@ -16,10 +16,9 @@ pub(crate) fn homography(pairs: &[([f64; 2], [f64; 2])]) -> Option<Matrix3<f64>>
     let (to_norm, to) = normalised(pairs.iter().map(|p| p.1))?;
     let mut a = DMatrix::<f64>::zeros(9, 9);
     for ([x, y], [u, v]) in from.into_iter().zip(to) {
-        for row in [
-            [x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y, -u],
-            [0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y, -v],
-        ] {
+        for row in
+            [[x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y, -u], [0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y, -v]]
+        {
             for i in 0..9 {
                 for j in 0..9 {
                     a[(i, j)] += row[i] * row[j];
@@ -40,19 +39,14 @@ pub(crate) fn homography(pairs: &[([f64; 2], [f64; 2])]) -> Option<Matrix3<f64>>
 }
 
 /// Points moved and scaled to mean 0 and mean square 2, and the map that does it.
-fn normalised(
-    points: impl Iterator<Item = [f64; 2]> + Clone,
-) -> Option<(Matrix3<f64>, Vec<[f64; 2]>)> {
+fn normalised(points: impl Iterator<Item = [f64; 2]> + Clone) -> Option<(Matrix3<f64>, Vec<[f64; 2]>)> {
     let n = points.clone().count() as f64;
     let sum = points.clone().fold([0.0; 2], |s, p| [s[0] + p[0], s[1] + p[1]]);
     let mean = sum.map(|s| s / n);
     let square: f64 = points.clone().map(|p| (p[0] - mean[0]).powi(2) + (p[1] - mean[1]).powi(2)).sum();
     let scale = (2.0 * n / square).sqrt();
-    let norm =
-        Matrix3::new(scale, 0.0, -scale * mean[0], 0.0, scale, -scale * mean[1], 0.0, 0.0, 1.0);
-    scale
-        .is_finite()
-        .then(|| (norm, points.map(|p| [0, 1].map(|l| (p[l] - mean[l]) * scale)).collect()))
+    let norm = Matrix3::new(scale, 0.0, -scale * mean[0], 0.0, scale, -scale * mean[1], 0.0, 0.0, 1.0);
+    scale.is_finite().then(|| (norm, points.map(|p| [0, 1].map(|l| (p[l] - mean[l]) * scale)).collect()))
 }
 
 /// F from the condition that the board's axes are perpendicular and equally long in every view,

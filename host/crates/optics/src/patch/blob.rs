@@ -82,11 +82,8 @@ pub(crate) fn regions(kinds: &mut [Kind], width: usize, height: usize) -> Vec<Bl
         let n = area as f64;
         let (mx, my) = (sums[0] / n, sums[1] / n);
         // 1/12: a pixel is a square, not a point.
-        let moments = [
-            sums[2] / n - mx * mx + 1.0 / 12.0,
-            sums[3] / n - mx * my,
-            sums[4] / n - my * my + 1.0 / 12.0,
-        ];
+        let moments =
+            [sums[2] / n - mx * mx + 1.0 / 12.0, sums[3] / n - mx * my, sums[4] / n - my * my + 1.0 / 12.0];
         blobs.push(Blob { centre: [x0 + mx, y0 + my], area, moments, cut });
     }
     blobs

@@ -181,7 +181,8 @@ mod tests {
     fn mid_level_of_a_two_valued_pattern_is_halfway() {
         // 20 % of the pixels at 40, the others at 200; the window holds whole periods.
         let n = 45;
-        let data: Vec<f32> = (0..n * n).map(|k| if (k % n + k / n) % 5 == 0 { 40.0 } else { 200.0 }).collect();
+        let data: Vec<f32> =
+            (0..n * n).map(|k| if (k % n + k / n) % 5 == 0 { 40.0 } else { 200.0 }).collect();
         let plane = Plane { width: n, height: n, data, used: None };
         let (mid, std) = plane.mid_levels(7);
         let middle = n / 2 * n + n / 2;

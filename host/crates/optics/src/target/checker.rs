@@ -187,7 +187,9 @@ pub(crate) fn refine(view: &GreyView<'_>, plane: &Plane, found: &Found) -> Vec<R
             // Short of the next parallel edge, but never so short that nothing is left to fit.
             let reach = (0.6 * cross / a[0].hypot(a[1]).max(b[0].hypot(b[1]))).clamp(3.5, 14.0);
             let pixels = view.patch(centre, reach, 0.1, |_| true)?;
-            let level = |s: f64| plane.sample(centre[0] + 0.3 * (a[0] + s * b[0]), centre[1] + 0.3 * (a[1] + s * b[1]));
+            let level = |s: f64| {
+                plane.sample(centre[0] + 0.3 * (a[0] + s * b[0]), centre[1] + 0.3 * (a[1] + s * b[1]))
+            };
             let (one, other) = (level(1.0)?, level(-1.0)?);
             let unit = |v: [f64; 2]| v.map(|c| c / v[0].hypot(v[1]));
             let levels = [0.5 * (one + other), 0.5 * (one - other)];

@@ -83,15 +83,14 @@ pub(crate) fn search(plane: &Plane, wanted: Option<Polarity>) -> Found {
                 continue;
             }
             let blobs = candidates(&smoothed, &mid, &std, polarity);
-            let nodes: Vec<Node> = blobs
-                .iter()
-                .map(|b| Node { at: b.centre, bright: None, area: b.area as f64 })
-                .collect();
+            let nodes: Vec<Node> =
+                blobs.iter().map(|b| Node { at: b.centre, bright: None, area: b.area as f64 }).collect();
             let forms: Vec<Form> = blobs.iter().map(Blob::form).collect();
             let cells = Cells::new(&nodes, plane.width, plane.height);
             let seeds = seeds(&nodes, &forms, &cells, side as f64);
             let lattice = lattice::largest(&nodes, &cells, &seeds);
-            if lattice.len() > best.lattice.len() || (best.lattice.is_empty() && nodes.len() > best.nodes.len())
+            if lattice.len() > best.lattice.len()
+                || (best.lattice.is_empty() && nodes.len() > best.nodes.len())
             {
                 best = Found { nodes, lattice, forms, polarity: Some(polarity), scale: 1.0 };
             }

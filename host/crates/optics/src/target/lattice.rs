@@ -157,9 +157,7 @@ fn grow(nodes: &[Node], cells: &Cells, seed: &Seed) -> Lattice {
                 .within(nodes, expected, reach)
                 .into_iter()
                 .filter(|k| !taken.contains_key(k) && compatible(from, &nodes[*k]))
-                .min_by(|a, b| {
-                    distance(nodes[*a].at, expected).total_cmp(&distance(nodes[*b].at, expected))
-                });
+                .min_by(|a, b| distance(nodes[*a].at, expected).total_cmp(&distance(nodes[*b].at, expected)));
             if let Some(found) = nearest {
                 let mut own = vectors;
                 own[axis] = difference(nodes[found].at, from.at).map(|v| v * f64::from(sign));
