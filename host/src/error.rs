@@ -19,6 +19,65 @@ pub enum Error {
         /// Columns and rows of the first frame.
         expected: (usize, usize),
     },
+    /// An image in which no board was found.
+    #[error("{}: {source}", path.display())]
+    Target {
+        /// The image.
+        path: PathBuf,
+        /// Why.
+        source: daic_optics::target::TargetError,
+    },
+    /// An image that no detector can work on.
+    #[error("{}: {source}", path.display())]
+    Detector {
+        /// The image.
+        path: PathBuf,
+        /// Why.
+        source: daic_optics::GreyError,
+    },
+    /// Not one image with a board.
+    #[error("none of the {images} images shows a board; the first: {reason}")]
+    NoBoards {
+        /// Images given.
+        images: usize,
+        /// Why the first does not.
+        reason: String,
+    },
+    /// A camera that the views do not give.
+    #[error("the camera cannot be calibrated: {0}")]
+    Intrinsics(#[from] daic_optics::intrinsics::CameraError),
+    /// A file of a camera that cannot be used.
+    #[error("{} is no file of a camera: {reason}", path.display())]
+    CameraFile {
+        /// The file.
+        path: PathBuf,
+        /// Line or field, and what is wrong.
+        reason: String,
+    },
+    /// A step of the alignment without an answer.
+    #[error("{}: {source}", path.display())]
+    Align {
+        /// The image.
+        path: PathBuf,
+        /// Why.
+        source: daic_optics::align::AlignError,
+    },
+    /// A step that needs a number that was not given.
+    #[error("this step needs {option}: {meaning}")]
+    AlignNeeds {
+        /// The flag.
+        option: &'static str,
+        /// What it says.
+        meaning: &'static str,
+    },
+    /// A record of the alignment that cannot be read.
+    #[error("{} is no record of an alignment: {reason}", path.display())]
+    AlignRecord {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
     /// Optics that no set-up can have.
     #[error("the optics cannot be used: {0}")]
     Optics(#[from] daic_optics::OpticsError),

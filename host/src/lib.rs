@@ -12,11 +12,15 @@
 //!   says what such a measurement can resolve.
 //! * [`phase`]: phases of gratings and displacements from them.
 //! * [`calibrate_rig`]: points tracked on a plate become an optics file.
+//! * [`calibrate_camera`]: a camera from images of a board; [`align`]: lining up a rig.
 //! * [`sequence`]: the same of a series of images.
 //! * [`microscope`]: calibration of the microscope from known motions.
 
+pub mod align;
 pub mod area;
 pub mod calibrate_rig;
+pub mod calibrate_camera;
+pub mod camera_file;
 #[cfg(feature = "sim")]
 pub mod demo;
 pub mod doctor;

@@ -21,6 +21,8 @@ fn help_names_every_command() {
         "correlate",
         "profile",
         "displacement",
+        "calibrate",
+        "align",
         "init",
         "schema",
         "doctor",

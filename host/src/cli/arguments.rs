@@ -1,5 +1,6 @@
 //! Commands and their flags.
 
+use super::align::AlignArgs;
 use super::calibrate::CalibrateArgs;
 use super::plan::PlanArgs;
 use super::strain::{NoiseFloorArgs, ProbeArgs, StrainArgs};
@@ -55,6 +56,8 @@ pub enum Command {
     Calibrate(CalibrateArgs),
     /// What a set-up will be able to measure: field, overlaps, uncertainty, light, and what to change
     Plan(PlanArgs),
+    /// Line up camera, laser and gratings, step by step, from stored images
+    Align(AlignArgs),
     /// Write a commented experiment file
     Init(InitArgs),
     /// Print the JSON schema of the experiment file
@@ -404,6 +407,14 @@ pub struct Roi(pub [i64; 4]);
 /// Displacement in pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shift(pub [f64; 2]);
+
+/// A number above 0.
+pub fn positive(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(v) if v > 0.0 && v.is_finite() => Ok(v),
+        _ => Err(format!("found `{text}`, wanted a number above 0")),
+    }
+}
 
 pub fn numbers<T: std::str::FromStr, const N: usize>(text: &str, form: &str) -> Result<[T; N], String> {
     let parsed: Option<Vec<T>> = text.split(',').map(|part| part.trim().parse().ok()).collect();

@@ -1,5 +1,6 @@
 //! `daic calibrate rig`.
 
+use super::arguments::positive;
 use super::commands::as_json;
 use super::output::Answer;
 use clap::Args;
@@ -30,13 +31,6 @@ pub struct RigArgs {
     /// Folder for optics.toml and the report
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-}
-
-fn positive(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(v) if v > 0.0 && v.is_finite() => Ok(v),
-        _ => Err(format!("found `{text}`, wanted a number above 0")),
-    }
 }
 
 pub fn calibrate(arguments: &RigArgs) -> Result<Answer, Error> {

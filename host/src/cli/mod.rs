@@ -1,8 +1,10 @@
 //! Flags, progress and the shape of answers.
 
+mod align;
 mod arguments;
 mod calibrate;
 mod calibrate_rig;
+mod camera;
 mod commands;
 mod microscope;
 mod output;
@@ -61,6 +63,7 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Displacement(arguments) => commands::displacement(arguments, output),
         Command::Calibrate(arguments) => calibrate::calibrate(arguments, output),
         Command::Plan(arguments) => plan::plan(arguments),
+        Command::Align(arguments) => align::align(arguments),
         Command::Init(arguments) => commands::init(arguments),
         Command::Schema => commands::schema(),
         Command::Doctor(arguments) => commands::doctor(arguments),

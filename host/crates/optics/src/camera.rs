@@ -148,7 +148,7 @@ fn distort<T: Real>(b: &Coefficients<T>, [x, y]: [T; 2]) -> [T; 2] {
 }
 
 /// ∂(observed)/∂(ideal) at the ideal coordinates `q`, and the observed coordinates.
-fn distort_jacobian(b: &Coefficients<f64>, q: [f64; 2]) -> ([f64; 2], [[f64; 2]; 2]) {
+pub(crate) fn distort_jacobian(b: &Coefficients<f64>, q: [f64; 2]) -> ([f64; 2], [[f64; 2]; 2]) {
     let b = b.map(Dual::constant);
     let d = distort(&b, [Dual::<2>::variable(q[0], 0), Dual::<2>::variable(q[1], 1)]);
     (d.map(|d| d.value), d.map(|d| d.gradient))

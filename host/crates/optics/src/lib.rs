@@ -25,12 +25,15 @@
 //! known moves, [`bundle`] everything from views of a plate in several poses.
 //! [`microscope`] holds the same for the microscope. What both are is [`PairModel`]. [`plan`](mod@plan) says what a
 //! set-up will be able to measure; [`surface`] is the strain on a measured surface.
+//! [`target`] finds calibration boards in images, [`intrinsics`] calibrates a camera from them,
+//! [`align`] helps to line up a rig.
 
 #![allow(
     clippy::neg_cmp_op_on_partial_ord,
     reason = "!(a > b) is written where a NaN must be refused as well"
 )]
 
+pub mod align;
 mod banded;
 pub mod bundle;
 pub mod calibrate;
@@ -43,11 +46,14 @@ mod model;
 mod pair_model;
 pub mod parameter;
 pub mod plan;
+pub mod intrinsics;
+pub mod patch;
 mod project;
 mod real;
 mod robust;
 mod setup;
 pub mod surface;
+pub mod target;
 
 pub use bundle::{Component, RigCalibration, RigData, RigError, RigSettings, calibrate_rig};
 pub use calibrate::{CalibrateError, Calibration, Estimate, Observation, Settings, TrackedPoint, calibrate};
@@ -60,5 +66,6 @@ pub use parameter::{
     CovarianceError, GratingParameter, Parameter, ParameterCovariance, ParameterJacobian, UnknownParameter,
 };
 pub use pair_model::PairModel;
+pub use patch::{GreyError, GreyView};
 pub use project::DisparityRange;
 pub use setup::{Optics, OpticsError, ReferenceFrame, View};
