@@ -9,6 +9,7 @@ pub fn measure_settings(processing: &Processing) -> measure::Settings {
         dic: daic_correlate::Settings {
             subset: processing.subset as usize,
             shape: match processing.shape {
+                experiment::Shape::Translation => daic_correlate::Shape::Translation,
                 experiment::Shape::Affine => daic_correlate::Shape::Affine,
                 experiment::Shape::Quadratic => daic_correlate::Shape::Quadratic,
             },
@@ -16,6 +17,15 @@ pub fn measure_settings(processing: &Processing) -> measure::Settings {
                 experiment::Interpolation::Cubic => daic_correlate::Interpolation::Cubic,
                 experiment::Interpolation::Quintic => daic_correlate::Interpolation::Quintic,
                 experiment::Interpolation::Septic => daic_correlate::Interpolation::Septic,
+            },
+            criterion: match processing.criterion {
+                experiment::Criterion::Znssd => daic_correlate::Criterion::Znssd,
+                experiment::Criterion::Zssd => daic_correlate::Criterion::Zssd,
+            },
+            solver: match processing.solver {
+                experiment::Solver::Auto => daic_correlate::SolverChoice::Auto,
+                experiment::Solver::Exact => daic_correlate::SolverChoice::Exact,
+                experiment::Solver::Dense => daic_correlate::SolverChoice::Dense,
             },
             tolerance: processing.convergence,
             max_iterations: processing.max_iterations,

@@ -14,7 +14,7 @@ mod sequence;
 
 pub use optics::{Brown, Covariance, Grating, Optics, OpticsFile, Reference, Side, Substrate};
 pub use problem::{ConfigError, Problem, ProblemKind};
-pub use processing::{Decoder, Interpolation, Processing, Shape};
+pub use processing::{Criterion, Decoder, Interpolation, Processing, Shape, Solver};
 pub use rig::{Axes, Axis, CameraSection, CameraSource, Rig, Strobe};
 pub use sequence::{FrameStep, LevelStep, MoveStep, RepeatStep, Role, Step};
 

@@ -16,6 +16,10 @@ pub struct Processing {
     pub shape: Shape,
     /// B-spline that interpolates grey levels.
     pub interpolation: Interpolation,
+    /// What is minimised.
+    pub criterion: Criterion,
+    /// Which form of the correlation solves the points.
+    pub solver: Solver,
     /// How a pair of views becomes a point in space.
     pub decoder: Decoder,
     /// Whether the calibration frames, where there are any, set F and the distances; without, the
@@ -46,6 +50,8 @@ impl Default for Processing {
             step: 10,
             shape: Shape::Quadratic,
             interpolation: Interpolation::Quintic,
+            criterion: Criterion::Znssd,
+            solver: Solver::Auto,
             decoder: Decoder::Ray,
             calibrate: true,
             axis_height: Length::new(0.0),
@@ -62,6 +68,8 @@ impl Default for Processing {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Shape {
+    /// Order 0: 2 parameters.
+    Translation,
     /// First order: 6 parameters.
     Affine,
     /// Second order: 12 parameters.
@@ -78,6 +86,28 @@ pub enum Interpolation {
     Quintic,
     /// Degree 7.
     Septic,
+}
+
+/// What is minimised.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Criterion {
+    /// Zero-mean normalised sum of squared differences: blind to brightness and contrast.
+    Znssd,
+    /// Zero-mean sum of squared differences: blind to brightness.
+    Zssd,
+}
+
+/// Which form of the correlation solves the points.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Solver {
+    /// The dense form where it is valid, the exact one elsewhere.
+    Auto,
+    /// Every point by its own iteration.
+    Exact,
+    /// The dense form alone; points it does not answer for are left out.
+    Dense,
 }
 
 /// How a pair of views becomes a point in space.
