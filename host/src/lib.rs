@@ -18,8 +18,8 @@
 
 pub mod align;
 pub mod area;
-pub mod calibrate_rig;
 pub mod calibrate_camera;
+pub mod calibrate_rig;
 pub mod camera_file;
 #[cfg(feature = "sim")]
 pub mod demo;

@@ -10,7 +10,6 @@ use daic::align::{self, BoardOptions, Mark, Step};
 use daic::camera_file::CameraFile;
 use daic_optics::align::Measured;
 use serde::Serialize;
-use serde_json::json;
 use std::fmt::Write as _;
 use std::path::PathBuf;
 

@@ -44,8 +44,6 @@ pub enum Command {
     Probe(ProbeArgs),
     /// Noise of displacement and strain, from frames of a specimen that does not move
     NoiseFloor(NoiseFloorArgs),
-    /// Calibrate the optics
-    Calibrate(CalibrateArgs),
     /// Phases of a line or cross grating; with a second image, the displacement between both
     Phase(PhaseArgs),
     /// Height map of one frame with both first-order views

@@ -111,7 +111,7 @@ impl Moves {
         if let Some(format) = moves.format.as_ref().filter(|f| *f != Self::FORMAT) {
             return Err(wrong(format!("format is \"{format}\", allowed is \"{}\"", Self::FORMAT)).into());
         }
-        if let Some(sigma) = moves.sigma.filter(|s| !(s.px() > 0.0)) {
+        if let Some(sigma) = moves.sigma.filter(|s| s.px().is_nan() || s.px() <= 0.0) {
             return Err(wrong(format!("sigma is {sigma}, it must be above 0 px")).into());
         }
         if let Some(c) = moves.correlation.filter(|c| !(c.subset.px() > 0.0 && c.step.px() > 0.0)) {

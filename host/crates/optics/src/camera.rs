@@ -95,15 +95,21 @@ pub(crate) struct CameraModel<T> {
 }
 
 /// k1, k2, k3, p1, p2.
-type Coefficients<T> = [T; 5];
+pub(crate) type Coefficients<T> = [T; 5];
+
+impl Brown {
+    /// In their order.
+    pub(crate) fn coefficients(&self) -> Coefficients<f64> {
+        [self.k1, self.k2, self.k3, self.p1, self.p2]
+    }
+}
 
 impl<T: Real> CameraModel<T> {
     pub(crate) fn new(camera: &Camera) -> Self {
-        let b = &camera.brown;
         Self::of(
             T::constant(camera.focal_px),
             camera.principal_point_px.map(T::constant),
-            [b.k1, b.k2, b.k3, b.p1, b.p2].map(T::constant),
+            camera.brown.coefficients().map(T::constant),
         )
     }
 

@@ -40,14 +40,14 @@ pub mod calibrate;
 pub mod camera;
 pub mod decode;
 pub mod grating;
+pub mod intrinsics;
 pub mod maps;
 pub mod microscope;
 mod model;
 mod pair_model;
 pub mod parameter;
-pub mod plan;
-pub mod intrinsics;
 pub mod patch;
+pub mod plan;
 mod project;
 mod real;
 mod robust;
@@ -62,10 +62,10 @@ pub use decode::{Decoded, Decoder, Displacement, PixelPair, UncertainPoint, pixe
 pub use grating::{DiffractError, Grating, GratingFrame, Substrate, SubstrateSide};
 pub use maps::{DistortionMap, DistortionMaps, MapError, MapFit, MapGrid, MapSample};
 pub use model::{OpticalModel, Ray, TraceError};
+pub use pair_model::PairModel;
 pub use parameter::{
     CovarianceError, GratingParameter, Parameter, ParameterCovariance, ParameterJacobian, UnknownParameter,
 };
-pub use pair_model::PairModel;
 pub use patch::{GreyError, GreyView};
 pub use project::DisparityRange;
 pub use setup::{Optics, OpticsError, ReferenceFrame, View};

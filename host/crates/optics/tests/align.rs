@@ -91,10 +91,10 @@ fn spots_to_a_fiftieth_of_a_pixel() {
         let image = image.recorded(2.0, 255.0, seed);
         let spots = find_spots(&view(&image), 3, 250.0).unwrap();
         for (s, t) in spots.iter().zip(&truth) {
-            for l in 0..2 {
-                let e = s.at_px[l] - t[l];
+            for ((at, sigma), t) in s.at_px.iter().zip(&s.sigma_px).zip(t) {
+                let e = at - t;
                 sum += e * e;
-                pulls += (e / s.sigma_px[l]).powi(2);
+                pulls += (e / sigma).powi(2);
                 n += 1.0;
             }
         }

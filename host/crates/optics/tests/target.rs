@@ -48,10 +48,10 @@ fn score(target: &Target, camera: &Camera, pose: &Pose, size: [i32; 2], pitch: f
         let (index, t) = truth.iter().min_by(|a, b| apart(a.1).total_cmp(&apart(b.1))).unwrap();
         assert!(apart(t) < 1.0, "{:?} is no point of the board: {:.3} px from {t:?}", p.at_px, apart(t));
         pairs.push((p.index, *index));
-        for l in 0..2 {
-            let e = p.at_px[l] - t[l];
+        for ((at, sigma), t) in p.at_px.iter().zip(&p.sigma_px).zip(t) {
+            let e = at - t;
             sum += e * e;
-            pulls += (e / p.sigma_px[l]).powi(2);
+            pulls += (e / sigma).powi(2);
         }
         worst = worst.max(apart(t));
     }

@@ -33,7 +33,7 @@ fn project(
         return None;
     }
     let [x, y] = [p.x / p.z, p.y / p.z];
-    let ([dx, dy], by_q) = distort_jacobian(&camera.brown, [x, y]);
+    let ([dx, dy], by_q) = distort_jacobian(&camera.brown.coefficients(), [x, y]);
     let f = camera.focal_px;
     let [cx, cy] = camera.principal_point_px;
     let r2 = x * x + y * y;
