@@ -157,8 +157,9 @@ fn bad_input_is_named() {
     let fails = |arguments: &[&str], words: &[&str]| {
         let output = daic(arguments);
         assert_eq!(output.status.code(), Some(2), "{arguments:?}");
-        let said: String =
-            String::from_utf8_lossy(&output.stderr).split_whitespace().collect::<Vec<_>>().join(" ");
+        // without the frame that the message is wrapped in
+        let said = String::from_utf8_lossy(&output.stderr).replace(['│', '├', '╰', '─', '▶'], " ");
+        let said: String = said.split_whitespace().collect::<Vec<_>>().join(" ");
         for word in words {
             assert!(said.contains(word), "{word} is not in {said}");
         }
