@@ -98,7 +98,8 @@ pub fn write(found: &Findings) -> String {
     p.push_str(
         "- Settings: quintic B-spline, ZNSSD, step 5, centres 40 px inside the image (35 721 points), stop at 10⁻³ px, one thread unless stated\n\
          - Counted: everything from 8-bit pixels in memory to points with σ and status, in seconds of processor time. *Warm*: both images new, memory and the grid of points kept, 7 repeats in each process. *Cold*: the first run of a process, all memory fresh, the grid included\n\
-         - Median (smallest–largest) over all processes\n\n",
+         - Median (smallest–largest) over all processes\n\
+         - The speed of a virtual machine may change by half within minutes: compare rows within a section; ratios to pyvale are of runs in turn\n\n",
     );
     if !found.remarks.is_empty() {
         p.push_str("Not measured in this run:\n\n");

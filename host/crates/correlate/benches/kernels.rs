@@ -4,7 +4,9 @@
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use daic_correlate::bench_support::Bench;
-use daic_correlate::{Image, Interpolation, Settings, Shape};
+use daic_correlate::{
+    Guess, Image, Interpolation, Points, Reference, Roi, Settings, Shape, Target, Workspace,
+};
 use std::hint::black_box;
 use std::time::Duration;
 
@@ -33,23 +35,21 @@ fn planes(c: &mut Criterion) {
         ("quintic", Interpolation::Quintic),
         ("septic", Interpolation::Septic),
     ] {
-        c.benchmark_group(format!("image 512²: load and prefilter, {name}"))
+        c.benchmark_group(format!("image 512², load and prefilter, {name}"))
             .bench_function("simd", |t| t.iter(|| b.prefilter(kind)));
     }
-    c.benchmark_group("image 512²: load and gradient, x")
-        .bench_function("simd", |t| t.iter(|| b.gradient_x()));
-    c.benchmark_group("image 512²: load and gradient, y")
-        .bench_function("simd", |t| t.iter(|| b.gradient_y()));
+    c.benchmark_group("image 512², load and both gradients")
+        .bench_function("simd", |t| t.iter(|| b.gradients()));
 }
 
 fn subsets(c: &mut Criterion) {
     let mut b = bench(Shape::Affine);
-    let mut group = c.benchmark_group("subset: load and moments, affine");
+    let mut group = c.benchmark_group("subset, load and moments, affine");
     group.bench_function("simd", |t| t.iter(|| black_box(b.subset_affine())));
     group.bench_function("scalar", |t| t.iter(|| black_box(b.subset_scalar(1))));
     group.finish();
     let mut b = bench(Shape::Quadratic);
-    let mut group = c.benchmark_group("subset: load and moments, quadratic");
+    let mut group = c.benchmark_group("subset, load and moments, quadratic");
     group.bench_function("simd", |t| t.iter(|| black_box(b.subset_quadratic())));
     group.bench_function("scalar", |t| t.iter(|| black_box(b.subset_scalar(2))));
     group.finish();
@@ -57,12 +57,12 @@ fn subsets(c: &mut Criterion) {
 
 fn sweeps(c: &mut Criterion) {
     let mut b = bench(Shape::Affine);
-    let mut group = c.benchmark_group("exact: one sweep, affine");
+    let mut group = c.benchmark_group("exact, one sweep, affine");
     group.bench_function("simd", |t| t.iter(|| black_box(b.sweep_affine())));
     group.bench_function("scalar", |t| t.iter(|| black_box(b.sweep_scalar(1))));
     group.finish();
     let mut b = bench(Shape::Quadratic);
-    let mut group = c.benchmark_group("exact: one sweep, quadratic");
+    let mut group = c.benchmark_group("exact, one sweep, quadratic");
     group.bench_function("simd", |t| t.iter(|| black_box(b.sweep_quadratic())));
     group.bench_function("scalar", |t| t.iter(|| black_box(b.sweep_scalar(2))));
     group.finish();
@@ -71,10 +71,25 @@ fn sweeps(c: &mut Criterion) {
 fn search(c: &mut Criterion) {
     let mut b = bench(Shape::Affine);
     let mut find = b.search(47);
-    c.benchmark_group("search: ±47 px by FFT").bench_function("simd", |t| t.iter(|| black_box(find())));
+    c.benchmark_group("search, ±47 px by FFT").bench_function("simd", |t| t.iter(|| black_box(find())));
 }
 
-// the dense form's kernels: one function here, one group each, as above
+/// The dense form as a whole: it has no scalar twin; the tests hold it to the exact form, which has one.
+fn dense(c: &mut Criterion) {
+    for (name, shape) in [("affine", Shape::Affine), ("quadratic", Shape::Quadratic)] {
+        let settings = Settings { shape, ..Settings::default() };
+        let reference = Reference::new(texture(0.0, 0.0));
+        let target = Target::new(texture(1.3, -0.4), settings.interpolation);
+        let points = Points::grid(SIZE, SIZE, settings.subset, 5, &Roi::default()).expect("a grid");
+        let mut workspace = Workspace::new();
+        c.benchmark_group(format!("dense, 512² pair, {name}")).bench_function("simd", |t| {
+            t.iter(|| {
+                let run = workspace.correlate(&reference, &target, &points, &Guess::Fft, &settings, &());
+                black_box(run.expect("a correlation"))
+            })
+        });
+    }
+}
 
 criterion_group! {
     name = kernels;
@@ -82,6 +97,6 @@ criterion_group! {
         .sample_size(20)
         .warm_up_time(Duration::from_millis(300))
         .measurement_time(Duration::from_secs(1));
-    targets = planes, subsets, sweeps, search
+    targets = planes, subsets, sweeps, search, dense
 }
 criterion_main!(kernels);

@@ -4,7 +4,7 @@
 use crate::fft::{Search, Window};
 use crate::icgn::{Scratch, Solver};
 use crate::kernel::{Sampling, Sums, sweep};
-use crate::plane::{self, Plane};
+use crate::plane::{self, Plane, Work};
 use crate::scalar;
 use crate::simd::dispatch;
 use crate::subset::{Layout, Subset};
@@ -19,6 +19,8 @@ pub struct Bench {
     settings: Settings,
     layout: Layout,
     plane: Plane,
+    gradients: [Plane; 2],
+    work: Work,
     subset: Subset,
     warped: Vec<f32>,
     scratch: Scratch,
@@ -51,6 +53,8 @@ impl Bench {
             settings,
             layout,
             plane: Plane::default(),
+            gradients: Default::default(),
+            work: Work::default(),
             subset,
             warped: Vec::new(),
             scratch: Scratch::default(),
@@ -62,17 +66,13 @@ impl Bench {
     /// Loads and prefilters the deformed image.
     pub fn prefilter(&mut self, kind: Interpolation) {
         let (image, minus) = (&self.target.image, self.target.offset);
-        plane::coefficients(self.level, image, minus, kind, &mut self.plane);
+        plane::coefficients(self.level, image, minus, kind, &mut self.work, &mut self.plane);
     }
 
-    /// Loads the deformed image and differentiates along x.
-    pub fn gradient_x(&mut self) {
-        plane::gradient_x(self.level, &self.target.image, self.target.offset, &mut self.plane);
-    }
-
-    /// Loads the deformed image and differentiates along y.
-    pub fn gradient_y(&mut self) {
-        plane::gradient_y(self.level, &self.target.image, self.target.offset, &mut self.plane);
+    /// Loads the deformed image and differentiates along x and y.
+    pub fn gradients(&mut self) {
+        let (image, minus) = (&self.target.image, self.target.offset);
+        plane::gradients(self.level, image, minus, &mut self.work, self.gradients.each_mut());
     }
 
     /// Packs a subset and sums its moments for a shape function of order 1.

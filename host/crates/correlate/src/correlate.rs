@@ -1,7 +1,7 @@
 //! The run over all points: checks, initial guesses, propagation, verdicts.
 
 use crate::consistency;
-use crate::dense::Dense;
+use crate::dense::{self, Dense};
 use crate::discontinuity;
 use crate::domain::Domain;
 use crate::icgn::{Outcome, Solver};
@@ -148,6 +148,14 @@ pub enum CorrelateError {
         /// Most shifts accepted.
         limit: f64,
     },
+    /// The dense form alone was asked for where there is none.
+    #[error(
+        "the dense form needs the criterion ZNSSD and a regular grid of at least 4 × 4 points, {least_overlap} or more steps to a subset; `auto` and `exact` take any"
+    )]
+    NoDenseForm {
+        /// Steps that must fit into a subset.
+        least_overlap: usize,
+    },
     /// The observer asked to stop.
     #[error("the correlation was cancelled after {done} of {total} points")]
     Cancelled {
@@ -224,9 +232,12 @@ impl Workspace {
         let mut run = Propagation::new(&solver, points, observer);
         // the window sums know a free gain alone
         let plain = settings.criterion == Criterion::Znssd;
-        let dense = plain && self.dense.prepare(&solver, points);
-        let sparse = if dense { self.dense.sparse(points) } else { None };
+        let possible = plain && self.dense.prepare(&solver, points);
+        let sparse = if possible { self.dense.sparse(points) } else { None };
         let Some(sparse) = sparse else {
+            if settings.solver == SolverChoice::Dense {
+                return Err(CorrelateError::NoDenseForm { least_overlap: dense::OVERLAP });
+            }
             return run_exact(run, guess, start);
         };
         let loose = Settings { tolerance: settings.tolerance.max(LOOSE), ..settings.clone() };

@@ -306,7 +306,7 @@ fn iterate<S: Simd, const N: usize, const N1: usize, const O: usize>(
     let r = layout.radius as f64;
     let mut warp = guess.restricted(settings.shape);
     load::<S, O>(s, solver, scratch, x, y);
-    let Scratch { subset, normal, warped, fit, .. } = scratch;
+    let Scratch { subset, normal, warped, fit, cut } = scratch;
     // rounding of single precision over the subset's grey range
     let floor = 1e-10 * subset.count as f64 * subset.mean * subset.mean;
     if subset.sff <= floor {
@@ -359,7 +359,8 @@ fn iterate<S: Simd, const N: usize, const N1: usize, const O: usize>(
             Ok(a) => {
                 (out.independent, out.sigma) = (a.independent, a.sigma);
                 if a.excess > EXCESS {
-                    out.sigma = solver.sigma_in_noise(subset, &warp, offset, &numbers).unwrap_or(a.sigma);
+                    out.sigma =
+                        solver.sigma_in_noise((subset, cut), &warp, offset, &numbers).unwrap_or(a.sigma);
                 }
             }
             Err(status) => out.status = status,

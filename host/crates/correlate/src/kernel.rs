@@ -286,7 +286,7 @@ mod tests {
         let reference = Reference::new(texture());
         let mut plane = Plane::default();
         let level = Level::new();
-        plane::coefficients(level, reference.image(), 100.0, kind, &mut plane);
+        plane::coefficients(level, reference.image(), 100.0, kind, &mut Default::default(), &mut plane);
         let layout = Layout::new(radius);
         let (x, y) = (55, 52);
         let second = if order == 2 { gradient / 100.0 } else { 0.0 };
@@ -390,7 +390,7 @@ mod tests {
             [(Interpolation::Cubic, 4), (Interpolation::Quintic, 6), (Interpolation::Septic, 8)]
         {
             let mut plane = Plane::default();
-            plane::coefficients(Level::new(), &image, 0.0, kind, &mut plane);
+            plane::coefficients(Level::new(), &image, 0.0, kind, &mut Default::default(), &mut plane);
             for k in 0..50 {
                 let (x, y) = (60.0 + 0.83 * f64::from(k), 60.0 + 0.57 * f64::from(k));
                 let g = scalar::sample(&plane, taps, x, y);

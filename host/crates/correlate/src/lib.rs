@@ -21,6 +21,7 @@ mod image;
 mod kernel;
 mod noise;
 mod normal;
+mod per_thread;
 pub mod phase;
 mod plane;
 mod point;

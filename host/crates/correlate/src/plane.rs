@@ -1,6 +1,7 @@
 //! Image planes padded by mirroring, B-spline coefficients and gradients.
 
 use crate::image::Image;
+use crate::per_thread::PerThread;
 use crate::settings::Interpolation;
 use crate::simd::dispatch;
 use fearless_simd::{Level, f32x8, prelude::*};
@@ -61,6 +62,8 @@ impl Plane {
 /// Sets the length; new memory comes zeroed from the system, without being written.
 pub(crate) fn resize(data: &mut Vec<f32>, len: usize) {
     if data.capacity() < len {
+        // never both at once
+        *data = Vec::new();
         *data = vec![0.0; len];
     } else {
         data.resize(len, 0.0);
@@ -95,23 +98,34 @@ impl<const P: usize> Spline<P> {
     }
 }
 
+/// Working memory of the filters: two pieces for each thread.
+pub(crate) type Work = PerThread<[Vec<f32>; 2]>;
+
 /// Coefficients of the interpolating B-spline of an image less `minus`.
-pub(crate) fn coefficients(level: Level, image: &Image, minus: f32, kind: Interpolation, out: &mut Plane) {
+pub(crate) fn coefficients(
+    level: Level,
+    image: &Image,
+    minus: f32,
+    kind: Interpolation,
+    work: &mut Work,
+    out: &mut Plane,
+) {
+    work.prepare();
     match kind {
-        Interpolation::Cubic => along_both(level, image, minus, &CUBIC, out),
-        Interpolation::Quintic => along_both(level, image, minus, &QUINTIC, out),
-        Interpolation::Septic => along_both(level, image, minus, &SEPTIC, out),
+        Interpolation::Cubic => along_both(level, image, minus, &CUBIC, work, out),
+        Interpolation::Quintic => along_both(level, image, minus, &QUINTIC, work, out),
+        Interpolation::Septic => along_both(level, image, minus, &SEPTIC, work, out),
     }
 }
 
-/// d/dx of the interpolating quintic at the pixel centres.
-pub(crate) fn gradient_x(level: Level, image: &Image, minus: f32, out: &mut Plane) {
-    along_rows(level, image, minus, &QUINTIC, true, out);
-}
-
-/// d/dy of the interpolating quintic at the pixel centres.
-pub(crate) fn gradient_y(level: Level, image: &Image, minus: f32, out: &mut Plane) {
-    along_columns(level, image, minus, &QUINTIC, out);
+/// d/dx and d/dy of the interpolating quintic at the pixel centres.
+pub(crate) fn gradients(level: Level, image: &Image, minus: f32, work: &mut Work, [x, y]: [&mut Plane; 2]) {
+    work.prepare();
+    let work = &*work;
+    rayon::join(
+        || along_rows(level, image, minus, &QUINTIC, work, x),
+        || along_columns(level, image, minus, &QUINTIC, work, y),
+    );
 }
 
 /// One image row less a constant, mirrored at both ends.
@@ -128,46 +142,57 @@ fn load_row(src: &[f32], minus: f32, out: &mut [f32]) {
     }
 }
 
+/// d/dx, some rows at a time.
 fn along_rows<const P: usize>(
     level: Level,
     image: &Image,
     minus: f32,
     spline: &Spline<P>,
-    gradient: bool,
+    work: &Work,
     out: &mut Plane,
 ) {
     out.resize(image);
     let stride = out.stride;
-    let memory = || vec![0.0f32; 2 * stride * STRIP];
-    let strips = out.data.par_chunks_mut(stride * STRIP).enumerate();
-    strips.for_each_init(memory, |memory, (k, rows)| {
+    out.data.par_chunks_mut(stride * STRIP).enumerate().for_each(|(k, rows)| {
         for (i, row) in rows.chunks_exact_mut(stride).enumerate() {
             load_row(image.row(mirror(k * STRIP + i, image.height())), minus, row);
         }
-        dispatch!(level, s => filter_rows::<_, P>(s, stride, rows, spline, gradient, memory));
+        work.with(|[memory, _]| {
+            resize(memory, 2 * stride * STRIP);
+            dispatch!(level, s => filter_rows::<_, P>(s, stride, rows, spline, true, memory));
+        });
     });
 }
 
 /// Slabs of rows are filtered by themselves, each from `run_in` rows before it to as many after: the
 /// result does not depend on who filters which. The rows go through the filter along them first, in
 /// memory that is no larger than a slab.
-fn along_both<const P: usize>(level: Level, image: &Image, minus: f32, spline: &Spline<P>, out: &mut Plane) {
+fn along_both<const P: usize>(
+    level: Level,
+    image: &Image,
+    minus: f32,
+    spline: &Spline<P>,
+    work: &Work,
+    out: &mut Plane,
+) {
     out.resize(image);
     let (stride, rows) = (out.stride, out.rows);
-    let memory = || (vec![0.0f32; stride * (SLAB + 2 * spline.run_in)], vec![0.0f32; 2 * stride * STRIP]);
-    let slabs = out.data.par_chunks_mut(stride * SLAB).enumerate();
-    slabs.for_each_init(memory, |(between, strip), (k, slab)| {
-        let first = (k * SLAB) as i64 - spline.run_in as i64;
-        for (i, lines) in between.chunks_exact_mut(stride * STRIP).enumerate() {
-            for (j, row) in lines.chunks_exact_mut(stride).enumerate() {
-                let y = (first + (i * STRIP + j) as i64).clamp(0, rows as i64 - 1) as usize;
-                load_row(image.row(mirror(y, image.height())), minus, row);
+    out.data.par_chunks_mut(stride * SLAB).enumerate().for_each(|(k, slab)| {
+        work.with(|[between, strip]| {
+            resize(between, stride * (SLAB + 2 * spline.run_in));
+            resize(strip, 2 * stride * STRIP);
+            let first = (k * SLAB) as i64 - spline.run_in as i64;
+            for (i, lines) in between.chunks_exact_mut(stride * STRIP).enumerate() {
+                for (j, row) in lines.chunks_exact_mut(stride).enumerate() {
+                    let y = (first + (i * STRIP + j) as i64).clamp(0, rows as i64 - 1) as usize;
+                    load_row(image.row(mirror(y, image.height())), minus, row);
+                }
+                dispatch!(level, s => filter_rows::<_, P>(s, stride, lines, spline, false, strip));
             }
-            dispatch!(level, s => filter_rows::<_, P>(s, stride, lines, spline, false, strip));
-        }
-        dispatch!(level, s => filter_columns::<_, P>(s, between, stride, spline));
-        let used = spline.run_in * stride;
-        slab.copy_from_slice(&between[used..used + slab.len()]);
+            dispatch!(level, s => filter_columns::<_, P>(s, between, stride, spline));
+            let used = spline.run_in * stride;
+            slab.copy_from_slice(&between[used..used + slab.len()]);
+        });
     });
 }
 
@@ -178,28 +203,30 @@ fn along_columns<const P: usize>(
     image: &Image,
     minus: f32,
     spline: &Spline<P>,
+    work: &Work,
     out: &mut Plane,
 ) {
     out.resize(image);
     let (stride, rows) = (out.stride, out.rows);
-    let memory = || vec![0.0f32; COLUMNS * (SLAB + 2 * spline.run_in)];
-    let slabs = out.data.par_chunks_mut(stride * SLAB).enumerate();
-    slabs.for_each_init(memory, |memory, (k, slab)| {
-        for x in (0..stride).step_by(COLUMNS) {
-            let first = (k * SLAB) as i64 - spline.run_in as i64;
-            for (i, row) in memory.chunks_exact_mut(COLUMNS).enumerate() {
-                let y = (first + i as i64).clamp(0, rows as i64 - 1) as usize;
-                read(image.row(mirror(y, image.height())), minus, x, row);
+    out.data.par_chunks_mut(stride * SLAB).enumerate().for_each(|(k, slab)| {
+        work.with(|[memory, _]| {
+            resize(memory, COLUMNS * (SLAB + 2 * spline.run_in));
+            for x in (0..stride).step_by(COLUMNS) {
+                let first = (k * SLAB) as i64 - spline.run_in as i64;
+                for (i, row) in memory.chunks_exact_mut(COLUMNS).enumerate() {
+                    let y = (first + i as i64).clamp(0, rows as i64 - 1) as usize;
+                    read(image.row(mirror(y, image.height())), minus, x, row);
+                }
+                dispatch!(level, s => {
+                    filter_columns::<_, P>(s, memory, COLUMNS, spline);
+                    difference::<_, P>(s, memory, spline);
+                });
+                for (i, row) in slab.chunks_exact_mut(stride).enumerate() {
+                    let at = (i + spline.run_in) * COLUMNS;
+                    row[x..x + COLUMNS].copy_from_slice(&memory[at..at + COLUMNS]);
+                }
             }
-            dispatch!(level, s => {
-                filter_columns::<_, P>(s, memory, COLUMNS, spline);
-                difference::<_, P>(s, memory, spline);
-            });
-            for (i, row) in slab.chunks_exact_mut(stride).enumerate() {
-                let at = (i + spline.run_in) * COLUMNS;
-                row[x..x + COLUMNS].copy_from_slice(&memory[at..at + COLUMNS]);
-            }
-        }
+        });
     });
 }
 

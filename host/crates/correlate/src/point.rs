@@ -136,7 +136,8 @@ pub struct Point {
     /// Zero-normalised cross-correlation of the subset, −1…1; NaN where unknown. The ZNSSD
     /// criterion is 2 (1 − zncc).
     pub zncc: f32,
-    /// Sweeps over the subset of the final attempt, Levenberg–Marquardt included.
+    /// Sweeps over the subset of the final attempt, Levenberg–Marquardt included; of a dense point, the
+    /// passes over the image (1 or 2).
     pub iterations: u16,
     /// Verdict. Where it is not `Converged`, u, v and the rest are what the last attempt left, for
     /// diagnosis only.

@@ -1,7 +1,7 @@
 //! Images made ready for correlation; kept and reused over a series.
 
 use crate::image::{Image, ImageError};
-use crate::plane::{self, Plane};
+use crate::plane::{self, Plane, Work};
 use crate::settings::Interpolation;
 use fearless_simd::Level;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -16,6 +16,7 @@ pub struct Reference {
     pub(crate) mean: f32,
     /// Differs between any two contents of any two references.
     pub(crate) id: u64,
+    work: Work,
 }
 
 /// Identities given out so far.
@@ -29,12 +30,20 @@ pub struct Target {
     /// Subtracted before the coefficients were made, so that single precision is not spent on it.
     pub(crate) offset: f32,
     pub(crate) interpolation: Interpolation,
+    work: Work,
 }
 
 impl Reference {
     /// Prepares a reference image.
     pub fn new(image: Image) -> Self {
-        let mut new = Self { image, gx: Plane::default(), gy: Plane::default(), mean: 0.0, id: 0 };
+        let mut new = Self {
+            image,
+            gx: Plane::default(),
+            gy: Plane::default(),
+            mean: 0.0,
+            id: 0,
+            work: Work::default(),
+        };
         new.prepare();
         new
     }
@@ -66,11 +75,8 @@ impl Reference {
         self.id = IDENTITIES.fetch_add(1, Ordering::Relaxed);
         self.mean = self.image.mean();
         let (level, mean) = (Level::new(), self.mean);
-        let Self { image, gx, gy, .. } = self;
-        rayon::join(
-            || plane::gradient_x(level, image, mean, gx),
-            || plane::gradient_y(level, image, mean, gy),
-        );
+        let Self { image, gx, gy, work, .. } = self;
+        plane::gradients(level, image, mean, work, [gx, gy]);
     }
 
     /// Exchanges the image for another, which gets the old one; no memory is allocated.
@@ -88,7 +94,8 @@ impl Reference {
 impl Target {
     /// Prepares a deformed image for the given interpolation.
     pub fn new(image: Image, interpolation: Interpolation) -> Self {
-        let mut target = Self { offset: 0.0, coefficients: Plane::default(), interpolation, image };
+        let mut target =
+            Self { offset: 0.0, coefficients: Plane::default(), interpolation, image, work: Work::default() };
         target.prepare();
         target
     }
@@ -118,8 +125,8 @@ impl Target {
 
     fn prepare(&mut self) {
         self.offset = self.image.mean();
-        let Self { image, offset, coefficients, interpolation } = self;
-        plane::coefficients(Level::new(), image, *offset, *interpolation, coefficients);
+        let Self { image, offset, coefficients, interpolation, work } = self;
+        plane::coefficients(Level::new(), image, *offset, *interpolation, work, coefficients);
     }
 
     /// The image.

@@ -67,7 +67,7 @@ impl Solver<'_> {
     /// `None` where next to nothing is left of it.
     pub(crate) fn sigma_in_noise(
         &self,
-        subset: &Subset,
+        (subset, cut): (&Subset, &Cut),
         warp: &Warp,
         offset: [f64; 2],
         numbers: &Numbers,
@@ -78,7 +78,7 @@ impl Solver<'_> {
         let gain2 = numbers.gain * numbers.gain;
         let passed = self.noise.interpolated_over(warp, r);
         let noise = self.noise_variance(numbers, passed);
-        let moments = self.moments(subset);
+        let moments = self.moments(cut);
         let mut true_matrix = Normal::matrix(subset, m, n);
         let mut of_noise = [[0.0; MAX]; MAX];
         for a in 0..m {
@@ -111,13 +111,9 @@ impl Solver<'_> {
         Some(out)
     }
 
-    /// Σ ξ^i η^j over the pixels used, in units of the radius.
-    fn moments(&self, subset: &Subset) -> [[f64; 5]; 5] {
+    /// Σ ξ^i η^j over the pixels used (`cut` row by row; all if it is empty), in units of the radius.
+    fn moments(&self, cut: &Cut) -> [[f64; 5]; 5] {
         let r = self.layout.radius as i32;
-        let mut cut = Cut::new();
-        if let Some((x, y)) = subset.centre {
-            self.cut(x, y, &mut cut);
-        }
         let powers = |x: i32| -> [f64; 5] {
             let x = f64::from(x) / f64::from(r);
             std::array::from_fn(|i| x.powi(i as i32))

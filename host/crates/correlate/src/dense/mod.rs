@@ -16,6 +16,7 @@ mod warp;
 
 use crate::correlate::Observer;
 use crate::icgn::{Outcome, Solver};
+use crate::per_thread::PerThread;
 use crate::point::Status;
 use crate::points::{Grid, Points};
 use crate::prepared::Reference;
@@ -25,7 +26,6 @@ use nodes::Nodes;
 use pass::{Buffers, DISTANCE, Pass, ZNCC, outputs};
 use rayon::prelude::*;
 use reference::{Layout, Prepared};
-use std::sync::Mutex;
 use tiling::{LANES, Task, Tiling, moments};
 
 /// Passes over the image, at most: the second brings the field of the first to within its own square; a
@@ -54,7 +54,7 @@ const CARRIES: f32 = 2.0;
 /// Distance between sparse points, in subset widths.
 const SPARSE: f64 = 1.6;
 /// Whole tiles in a subset from which sharing sums pays.
-const OVERLAP: usize = 2;
+pub(crate) const OVERLAP: usize = 2;
 
 /// What stays the same while reference, grid, subset and shape function do.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -80,22 +80,27 @@ impl Share {
         Self { task, prepared: Prepared::default(), out: Vec::new(), passes: 0, settled: false }
     }
 
-    /// Whether the last pass came close enough at nearly all points.
-    fn has_settled(&self, tiling: &Tiling, order: usize) -> bool {
+    /// Whether the last pass came close enough at nearly all points; `is_point` says which of the
+    /// tiling's nodes are points.
+    fn has_settled(&self, tiling: &Tiling, order: usize, is_point: impl Fn(usize, usize) -> bool) -> bool {
         let (m, layout) = (moments(order), Layout::new(order));
         let (size, block) = (outputs(order) * LANES, layout.len() * LANES);
         let width = (2 * tiling.radius + 1) as f32;
         let share = SETTLED * SETTLED / (width * width);
         let vectors = self.task.width / LANES;
-        let mut above = 0;
+        let (mut above, mut all) = (0, 0);
         let rows =
             self.out.chunks_exact(vectors * size).zip(self.prepared.constants.chunks_exact(vectors * block));
-        for (out, constants) in rows {
+        for (row, (out, constants)) in rows.enumerate() {
             for (k, (q, c)) in out.chunks_exact(size).zip(constants.chunks_exact(block)).enumerate() {
                 let used = LANES.min(self.task.columns.saturating_sub(k * LANES));
                 let q = &q[2 * m * LANES..];
                 let at = |values: &[f32], plane: usize, lane: usize| values[plane * LANES + lane];
                 for lane in 0..used {
+                    if !is_point(self.task.column + k * LANES + lane, self.task.row + row) {
+                        continue;
+                    }
+                    all += 1;
                     let distance = at(q, DISTANCE, lane);
                     let error = CURVATURE as f32 * distance * distance;
                     let residual = 2.0 * at(c, layout.sff(), lane) * (1.0 - at(q, ZNCC, lane)).max(0.0);
@@ -107,7 +112,7 @@ impl Share {
                 }
             }
         }
-        above as f32 <= UNSETTLED * (self.task.rows * self.task.columns) as f32
+        above as f32 <= UNSETTLED * all as f32
     }
 }
 
@@ -119,7 +124,7 @@ pub(crate) struct Dense {
     first: (usize, usize),
     shares: Vec<Share>,
     nodes: Nodes,
-    buffers: Vec<Mutex<Buffers>>,
+    buffers: PerThread<Buffers>,
 }
 
 fn order(settings: &Settings) -> usize {
@@ -173,8 +178,8 @@ impl Dense {
         };
         let order = order(solver.settings);
         let key = Key { reference: solver.reference.id, tiling, order };
-        let threads = rayon::current_num_threads();
-        self.buffers.resize_with(self.buffers.len().max(threads), Mutex::default);
+        self.buffers.prepare();
+        self.first = first;
         if self.key == Some(key) {
             return true;
         }
@@ -188,11 +193,10 @@ impl Dense {
                 self.shares.push(Share::new(*task));
             }
         }
-        self.first = first;
         self.key = Some(key);
         let buffers = &self.buffers;
         self.shares.par_iter_mut().for_each(|share| {
-            with(buffers, |b| {
+            buffers.with(|b| {
                 share.prepared.fill(
                     solver.level,
                     &tiling,
@@ -252,7 +256,7 @@ impl Dense {
         accept: bool,
         observer: &dyn Observer,
     ) -> Vec<(usize, Warp)> {
-        let Some(Key { tiling, order, .. }) = self.key else {
+        let (Some(Key { tiling, order, .. }), Some(grid)) = (self.key, points.as_grid()) else {
             return Vec::new();
         };
         let Some(known) = self.lattice(points, sparse, start) else {
@@ -278,18 +282,17 @@ impl Dense {
                 interpolation: solver.target.interpolation,
                 order,
             };
-            let buffers = &self.buffers;
+            let (buffers, first) = (&self.buffers, self.first);
             self.shares.par_iter_mut().filter(|s| !s.settled).for_each(|share| {
                 if !observer.cancelled() {
-                    with(buffers, |b| {
-                        pass.run(solver.level, &share.task, &share.prepared, b, &mut share.out)
-                    });
+                    buffers.with(|b| pass.run(solver.level, &share.task, &share.prepared, b, &mut share.out));
                     share.passes = number + 1;
-                    share.settled = share.has_settled(&tiling, order);
+                    share.settled = share
+                        .has_settled(&tiling, order, |i, j| grid.point(first.0 + i, first.1 + j).is_some());
                 }
             });
             observer.points(points.len() * (number + 1) / (PASSES + 1), points.len());
-            if observer.cancelled() {
+            if observer.cancelled() || self.shares.iter().any(|s| s.passes == 0) {
                 return Vec::new();
             }
         }
@@ -419,14 +422,4 @@ fn nearest(grid: &Grid, i: usize, j: usize, reach: usize) -> Option<usize> {
         }
     }
     None
-}
-
-/// Runs with the memory of the calling thread.
-fn with<T>(buffers: &[Mutex<Buffers>], f: impl FnOnce(&mut Buffers) -> T) -> T {
-    let own = rayon::current_thread_index().and_then(|i| buffers.get(i)).or(buffers.first());
-    match own.map(Mutex::try_lock) {
-        Some(Ok(mut b)) => f(&mut b),
-        // a thread from elsewhere
-        _ => f(&mut Buffers::default()),
-    }
 }
