@@ -17,7 +17,7 @@
 //!
 //! # Outliers
 //!
-//! As in [`crate::calibrate`]: a first fit uses Huber's loss; then points beyond
+//! As in [`calibrate`](mod@crate::calibrate): a first fit uses Huber's loss; then points beyond
 //! [`Settings::outlier_limit`] are left out until the selection stays the same.
 
 mod fit;
