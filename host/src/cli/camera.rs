@@ -62,7 +62,7 @@ pub struct CameraArgs {
     #[arg(long)]
     pub board: BoardArg,
     /// Distance of dots or corners in mm
-    #[arg(long, value_name = "MM", value_parser = positive)]
+    #[arg(long, value_name = "MM", value_parser = positive, allow_negative_numbers = true)]
     pub pitch: f64,
     /// Dots or inner corners in a row, if known
     #[arg(long, requires = "rows", value_parser = clap::value_parser!(u16).range(3..))]
