@@ -361,6 +361,9 @@ pub enum Error {
     /// A file of motions or of a microscope.
     #[error(transparent)]
     MicroscopeFile(#[from] crate::microscope::MicroscopeFileError),
+    /// A light field.
+    #[error(transparent)]
+    LightField(#[from] crate::lightfield::LightFieldError),
     /// A plan.
     #[error("no plan: {0}")]
     SetUp(#[from] daic_optics::plan::PlanError),

@@ -14,6 +14,7 @@
 //! * [`calibrate_rig`]: points tracked on a plate become an optics file.
 //! * [`calibrate_camera`]: a camera from images of a board; [`align`]: lining up a rig.
 //! * [`sequence`]: the same of a series of images.
+//! * [`lightfield`]: light fields become volumes.
 //! * [`microscope`]: calibration of the microscope from known motions.
 
 pub mod align;
@@ -30,6 +31,7 @@ mod figures;
 pub mod folder_camera;
 pub mod frames;
 pub mod images;
+pub mod lightfield;
 pub mod measure;
 pub mod microscope;
 pub mod noise_floor;

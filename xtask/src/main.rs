@@ -18,7 +18,9 @@ cargo xtask COMMAND
   figures    draws the pictures of README and docs anew with the program itself
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders
+             lightfield: speed and memory beside pyolaf, into docs/performance.md
              guard [--update]: instruction counts against the baseline (or: makes a new one)
+  reproduce  lightfield: chapter 4 of the thesis, figures and tables into docs/
 ";
 
 fn main() -> ExitCode {
@@ -35,6 +37,8 @@ fn main() -> ExitCode {
         ["figures"] => steps::figures(),
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),
+        ["bench", "lightfield"] => bench::lightfield::lightfield(),
+        ["reproduce", "lightfield"] => bench::lightfield::reproduce(),
         ["bench", "optics"] => steps::bench_optics(),
         ["bench", "guard"] => bench::guard::step(false),
         ["bench", "guard", "--update"] => bench::guard::step(true),

@@ -2,6 +2,7 @@
 
 use super::align::AlignArgs;
 use super::calibrate::CalibrateArgs;
+use super::lightfield::LightFieldArgs;
 use super::plan::PlanArgs;
 use super::strain::{NoiseFloorArgs, ProbeArgs, StrainArgs};
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -52,6 +53,8 @@ pub enum Command {
     Displacement(DisplacementArgs),
     /// Calibrate an instrument from measurements of something known
     Calibrate(CalibrateArgs),
+    /// Volumes from light-field frames: lattice, point spread function, reconstruction
+    Lightfield(LightFieldArgs),
     /// What a set-up will be able to measure: field, overlaps, uncertainty, light, and what to change
     Plan(PlanArgs),
     /// Line up camera, laser and gratings, step by step, from stored images

@@ -6,6 +6,7 @@ mod calibrate;
 mod calibrate_rig;
 mod camera;
 mod commands;
+mod lightfield;
 mod microscope;
 mod output;
 mod plan;
@@ -62,6 +63,7 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Profile(arguments) => commands::profile(arguments, output),
         Command::Displacement(arguments) => commands::displacement(arguments, output),
         Command::Calibrate(arguments) => calibrate::calibrate(arguments, output),
+        Command::Lightfield(arguments) => lightfield::lightfield(arguments, output),
         Command::Plan(arguments) => plan::plan(arguments),
         Command::Align(arguments) => align::align(arguments),
         Command::Init(arguments) => commands::init(arguments),

@@ -14,6 +14,7 @@ pub mod image_file;
 pub mod map;
 mod npz;
 pub mod table;
+pub mod volume;
 
 pub use atomic::WriteError;
 pub use dataset::{
@@ -24,3 +25,4 @@ pub use image_file::{GreyImage, ImageFileError, ReadNote, read_grey};
 pub use map::{FloatMap, MapAxes, MapError};
 pub use npz::NpzError;
 pub use table::{Column, Table, TableError};
+pub use volume::{Volume, VolumeError};
