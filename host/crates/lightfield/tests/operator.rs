@@ -109,7 +109,7 @@ const CASES: [Case; 9] = {
         Case { symmetry: Reduction::ComplexMirrorY, planes: 3, margin: -1, cells: [6, 5], ..base },
         Case { symmetry: Reduction::ComplexMirrorX, pixels: [5, 6], voxels: [3, 2], cells: [5, 7], ..base },
         Case { symmetry: Reduction::Complex, pixels: [3, 9], voxels: [2, 1], planes: 5, margin: 1, ..base },
-        Case { symmetry: Reduction::Complex, pixels: [2, 1], voxels: [1, 1], planes: 1, radius: 0, cells: [1, 1], ..base },
+        Case { symmetry: Reduction::Complex, pixels: [2, 3], voxels: [1, 1], planes: 1, radius: 0, cells: [1, 1], ..base },
     ]
 };
 

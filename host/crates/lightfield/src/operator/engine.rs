@@ -12,6 +12,17 @@ use crate::simd::{Kernel as Work, LANES, V, run};
 use fearless_simd::prelude::*;
 use rayon::prelude::*;
 
+/// i modulo n for i below 2 n; a division would cost as much as the transform.
+#[inline(always)]
+fn wrapped(i: usize, n: usize) -> usize {
+    if i >= n { i - n } else { i }
+}
+
+#[inline(always)]
+fn part<S: Simd>(s: S, values: &[f32], at: usize) -> V<S> {
+    V::from_slice(s, &values[at..at + LANES])
+}
+
 /// Volume or sensor.
 #[derive(Debug, Clone)]
 pub(crate) struct Side {
@@ -43,7 +54,7 @@ impl Side {
     /// The cell at grid position `g` of an axis, if there is one.
     #[inline(always)]
     fn cell_at(&self, axis: usize, g: usize, grid: usize) -> Option<usize> {
-        let i = (g + grid - self.origin[axis]) % grid;
+        let i = wrapped(g + grid - self.origin[axis], grid);
         (i < self.cells[axis]).then_some(i)
     }
 }
@@ -169,6 +180,7 @@ impl Engine {
         for f in frames.iter_mut() {
             f.plane.resize(half * py * wide, 0.0);
             let Spectra { rows, plane, .. } = f;
+            let rows: &[f32] = rows;
             plane.par_chunks_mut(py * wide).enumerate().for_each_init(Vec::new, |scratch, (kx, out)| {
                 run(self.level, ColumnForth { engine: self, side: &from.side, rows, out, kx, scratch });
             });
@@ -196,6 +208,7 @@ impl Engine {
             let rows = to.side.cells[0];
             f.columns.resize(half * rows * wide_to, 0.0);
             let Spectra { products, columns, .. } = f;
+            let products: &[f32] = products;
             columns.par_chunks_mut(rows * wide_to).enumerate().for_each_init(Vec::new, |scratch, (kx, out)| {
                 run(
                     self.level,
@@ -255,17 +268,17 @@ impl Work for RowForth<'_> {
                     Some(x) => {
                         let at = x * c + channel;
                         let im = if count > 1 {
-                            V::from_slice(s, &second[at..at + LANES])
+                            part(s, second, at)
                         } else {
                             V::splat(s, 0.0)
                         };
-                        C { re: V::from_slice(s, &first[at..at + LANES]), im }
+                        C { re: part(s, first, at), im }
                     }
                     None => C::zero(s),
                 },
             );
             for k in 0..engine.half() {
-                let (a, b) = (result(s, &scratch, k), result(s, &scratch, (n - k) % n));
+                let (a, b) = (result(s, &scratch, k), result(s, &scratch, wrapped(n - k, n)));
                 let at = k * 2 * c + channel;
                 ((a.re + b.re) * half).store_slice(&mut rows[at..at + LANES]);
                 ((a.im - b.im) * half).store_slice(&mut rows[at + c..at + c + LANES]);
@@ -309,12 +322,11 @@ impl Work for RowBack<'_> {
                     let mirrored = g > n / 2;
                     let k = if mirrored { n - g } else { g };
                     let at = k * column + first * 2 * c + channel;
-                    let part = |at: usize| V::from_slice(s, &columns[at..at + LANES]);
-                    let (a, mut b) = (part(at), part(at + c));
+                    let (a, mut b) = (part(s, columns, at), part(s, columns, at + c));
                     let (mut p, mut q) = (zero, zero);
                     if count > 1 {
-                        p = part(at + 2 * c);
-                        q = part(at + 3 * c);
+                        p = part(s, columns, at + 2 * c);
+                        q = part(s, columns, at + 3 * c);
                     }
                     if mirrored {
                         b = -b;
@@ -328,7 +340,7 @@ impl Work for RowBack<'_> {
                 },
             );
             for x in 0..side.cells[1] {
-                let v = result(s, &scratch, (x + side.origin[1]) % n);
+                let v = result(s, &scratch, wrapped(x + side.origin[1], n));
                 let at = x * c + channel;
                 v.re.store_slice(&mut one[at..at + LANES]);
                 v.im.store_slice(&mut two[at..at + LANES]);
@@ -365,8 +377,8 @@ impl Work for ColumnForth<'_> {
                     Some(y) => {
                         let at = y * row + kx * 2 * c + channel;
                         C {
-                            re: V::from_slice(s, &rows[at..at + LANES]),
-                            im: V::from_slice(s, &rows[at + c..at + c + LANES]),
+                            re: part(s, rows, at),
+                            im: part(s, rows, at + c),
                         }
                     }
                     None => C::zero(s),
@@ -424,13 +436,13 @@ impl Work for ColumnBack<'_> {
                 |k| {
                     let at = k * wide + channel;
                     C {
-                        re: V::from_slice(s, &column[at..at + LANES]),
-                        im: V::from_slice(s, &column[at + c..at + c + LANES]),
+                        re: part(s, column, at),
+                        im: part(s, column, at + c),
                     }
                 },
             );
             for y in 0..side.cells[0] {
-                let v = result(s, scratch, (y + side.origin[0]) % n);
+                let v = result(s, scratch, wrapped(y + side.origin[0], n));
                 let at = y * wide + channel;
                 v.re.store_slice(&mut out[at..at + LANES]);
                 v.im.store_slice(&mut out[at + c..at + c + LANES]);
@@ -488,7 +500,6 @@ impl<T: Element> Work for Multiply<'_, '_, T> {
                     let member = orbit.members[m];
                     let table = &from.tables[member.step];
                     let spectrum = &planes[f][(member.kx * engine.grid[0] + member.ky) * wide..][..wide];
-                    let cells = x.chunks_exact_mut(VECTORS);
                     if adjoint && !blocks.real {
                         // (yr, yi) for the real part of Hᴴy, (yi, −yr) for the imaginary one
                         let (upper, lower) = x.split_at_mut(channels * VECTORS);
@@ -502,6 +513,7 @@ impl<T: Element> Work for Multiply<'_, '_, T> {
                             l[2 * j + 1] = -re;
                         }
                     } else {
+                        let cells = x.chunks_exact_mut(VECTORS);
                         for ((place, sign), v) in table.from.iter().zip(&table.sign).zip(cells) {
                             v[2 * j] = sign[0] * spectrum[place[0] as usize];
                             v[2 * j + 1] = sign[1] * spectrum[place[1] as usize];

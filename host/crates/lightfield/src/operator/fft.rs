@@ -182,7 +182,7 @@ impl Plan {
                 let (from, to) = if to_result { (&*other, &mut *result) } else { (&*result, &mut *other) };
                 stage.run::<S, INVERSE>(
                     s,
-                    &#[inline(always)]
+                    #[inline(always)]
                     |i| get(s, from, i),
                     to,
                 );
@@ -199,7 +199,12 @@ pub(crate) fn result<S: Simd>(s: S, scratch: &[f32], i: usize) -> C<S> {
 
 impl Stage {
     #[inline(always)]
-    fn run<S: Simd, const INVERSE: bool>(&self, s: S, load: &impl Fn(usize) -> C<S>, to: &mut [f32]) {
+    fn run<S: Simd, const INVERSE: bool>(
+        &self,
+        s: S,
+        load: impl Fn(usize) -> C<S>,
+        to: &mut [f32],
+    ) {
         match self.radix {
             2 => self.pass::<S, 2, INVERSE>(s, load, to, #[inline(always)] |x| dft2(x)),
             3 => self.pass::<S, 3, INVERSE>(s, load, to, #[inline(always)] |x| dft3::<S, INVERSE>(s, x)),
@@ -212,7 +217,7 @@ impl Stage {
     fn pass<S: Simd, const R: usize, const INVERSE: bool>(
         &self,
         s: S,
-        load: &impl Fn(usize) -> C<S>,
+        load: impl Fn(usize) -> C<S>,
         to: &mut [f32],
         dft: impl Fn([C<S>; R]) -> [C<S>; R],
     ) {

@@ -256,9 +256,11 @@ pub fn reconstruct(
             }
         }
     });
-    let seen = match settings.method {
-        Method::Rl => fixed.clone(),
-        Method::Isra => passes.back_project(&volume, |image, row, values| {
+    let seen = match (settings.method, &path) {
+        (Method::Rl, _) => fixed.clone(),
+        // a sensor that catches all light sees every voxel
+        (Method::Isra, Path::Normal) => vec![vec![1f32; volume.len()]; frames.len()],
+        (Method::Isra, Path::TwoPasses { .. }) => passes.back_project(&volume, |image, row, values| {
             let at = row * sensor.row()..(row + 1) * sensor.row();
             match &weights {
                 Some(w) => values.copy_from_slice(&w[image][at]),
