@@ -129,6 +129,6 @@ fn transpose(m: &[Complex64], rows: usize, columns: usize, keep: std::ops::Range
 }
 
 /// Runs `work` for each item in parallel, results in order.
-pub(crate) fn each<T: Sync, R: Send>(items: &[T], work: impl Fn(&T) -> R + Sync) -> Vec<R> {
+pub(crate) fn each<T: Sync, R: Send>(items: &[T], work: impl Fn(&T) -> R + Sync + Send) -> Vec<R> {
     items.par_iter().map(work).collect()
 }
