@@ -158,8 +158,8 @@ pub fn cell_gains(lattice: &Lattice, white: &[f32], dark: Option<&[f32]>) -> Res
         sums[at].0 += f64::from(white[i] - dark.map_or(0.0, |d| d[i]));
         sums[at].1 += 1;
     }
-    // cells of which less than half is in the image take the mean of their neighbours
-    let enough = (0.5 * lattice.cell_area()) as usize;
+    // a part of a cell has another mean than the whole: cells cut by the border take that of their neighbours
+    let enough = (0.97 * lattice.cell_area()) as usize;
     let mut means: Vec<Option<f64>> =
         sums.iter().map(|&(s, n)| (n > enough && s > 0.0).then(|| s / n as f64)).collect();
     let mut sorted: Vec<f64> = means.iter().flatten().copied().collect();

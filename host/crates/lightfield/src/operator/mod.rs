@@ -351,6 +351,18 @@ impl Operator {
         self.estimate
     }
 
+    /// Rounding noise of a projection relative to its largest pixel: 1e-7, in half precision 1e-4.
+    pub fn rounding(&self) -> f32 {
+        let whole = match &self.form {
+            Form::Whole(whole) => whole,
+            Form::Tiled(tiles) => tiles.whole(),
+        };
+        match whole.store {
+            Store::Full(_) => 1e-7,
+            Store::Half(_) => 1e-4,
+        }
+    }
+
     /// (planes, rows, columns) of a volume.
     pub fn volume_shape(&self) -> [usize; 3] {
         self.geometry.volume()

@@ -16,6 +16,11 @@ impl Tiles {
         Self { whole, tile, geometry: geometry.clone() }
     }
 
+    /// The operator of one tile.
+    pub(crate) fn whole(&self) -> &Whole {
+        &self.whole
+    }
+
     pub(crate) fn through(&self, input: &[f32], forward: bool) -> Vec<f32> {
         let g = &self.geometry;
         let s = &g.shape;

@@ -7,8 +7,9 @@
 //! - ISRA (image space reconstruction algorithm): g ← g · Hᵀ(w (f − b)) / Hᵀ(w H g)
 //!
 //! Thesis (4.10), with its G⁻¹ read as the transpose, is ISRA, the least-squares relative of Richardson–Lucy.
-//! Two first orders add up in numerator and denominator. Denominators are not let below 1e-12, and voxels of
-//! which the sensor sees less than 1e-6 of what it sees of the best are set to zero.
+//! Two first orders add up in numerator and denominator. Denominators are not let below 1e-12, estimates of
+//! pixels not below the operator's rounding noise (1e-7 of the brightest pixel, 1e-4 in half precision), and
+//! voxels of which the sensor sees less than 1e-6 of what it sees of the best are set to zero.
 
 mod filters;
 mod passes;
@@ -151,7 +152,8 @@ pub struct Step {
     pub change: f64,
 }
 
-/// Denominators are not let below this.
+/// Denominators are not let below this, and estimates of pixels not below the rounding noise of the operator
+/// ([`Operator::rounding`]), relative to the brightest pixel: what is below may have any sign.
 const FLOOR: f32 = 1e-12;
 /// Share of the best seen voxel's light below which a voxel is not reconstructed.
 const UNSEEN: f32 = 1e-6;
@@ -231,6 +233,11 @@ pub fn reconstruct(
     }
     let squares: Vec<f64> = images.iter().map(|i| i.iter().map(|v| f64::from(*v).powi(2)).sum()).collect();
 
+    let rounding = model.operator.rounding();
+    let floors: Vec<f32> = images
+        .iter()
+        .map(|i| (rounding * i.iter().copied().fold(0.0f32, f32::max)).max(FLOOR))
+        .collect();
     let mut passes = Passes::new(model, frames.len());
     let path = choose(model, settings, weights.is_some());
     let normal = if path == Path::Normal { model.normal.as_ref() } else { None };
@@ -316,7 +323,7 @@ pub fn reconstruct(
                 let f = &images[image][at.clone()];
                 let b = background.as_ref().map(|b| &b[image][at.clone()]);
                 let w = weights.as_ref().map(|w| &w[image][at.clone()]);
-                pixels(settings, values, f, b, w)
+                pixels(settings, floors[image], values, f, b, w)
             });
             for (i, list) in residuals.iter_mut().enumerate() {
                 let of = i * orders..(i + 1) * orders;
@@ -403,7 +410,14 @@ fn choose(model: &Model, settings: &Settings, weighted: bool) -> Path {
 }
 
 /// What becomes of a row of estimates; returns Σ w (f − Hg − b)².
-fn pixels(settings: &Settings, values: &mut [f32], f: &[f32], b: Option<&[f32]>, w: Option<&[f32]>) -> f64 {
+fn pixels(
+    settings: &Settings,
+    floor: f32,
+    values: &mut [f32],
+    f: &[f32],
+    b: Option<&[f32]>,
+    w: Option<&[f32]>,
+) -> f64 {
     const PART: usize = 8;
     let mut sum = [0f32; PART];
     let mut total = 0.0;
@@ -417,7 +431,7 @@ fn pixels(settings: &Settings, values: &mut [f32], f: &[f32], b: Option<&[f32]>,
             let estimate = values[j];
             let d = f[j] - estimate - b;
             sum[j] += w * d * d;
-            values[j] = if rl { w * (f[j] + v) / (estimate + b + v).max(FLOOR) } else { w * estimate };
+            values[j] = if rl { w * (f[j] + v) / (estimate + b + v).max(floor) } else { w * estimate };
         }
         if i % 64 == 63 {
             total += sum.iter().map(|s| f64::from(*s)).sum::<f64>();
