@@ -3,7 +3,9 @@
 mod target;
 
 use daic::Error;
-use daic::calibrate_distortion::{DistortionFile, IdealImage, Options, Outcome, Warning, calibrate, phase_settings, run};
+use daic::calibrate_distortion::{
+    DistortionFile, IdealImage, Options, Outcome, Warning, calibrate, phase_settings, run,
+};
 use daic_optics::distortion::{DistortionCalibration, TargetPose};
 use daic_optics::{DistortionError, DistortionMaps, OpticalModel, Optics, View};
 use nalgebra::{DMatrix, DVector, Vector3};
@@ -31,22 +33,29 @@ fn options(images: Vec<PathBuf>, out: &Path) -> Options {
     }
 }
 
-/// Writes the two exposures or the cross, and says where they are.
-fn images(folder: &Path, scene: &Scene, poses: [Pose; 2], cross: bool, seed: u64) -> Vec<PathBuf> {
+/// Brightness of the two exposures or of the cross, with the names of their files.
+fn exposures(scene: &Scene, poses: [Pose; 2], cross: bool) -> Vec<(&'static str, Vec<f64>)> {
+    let one = |name, pose: usize, lines| (name, scene.brightness(&poses[pose], lines));
+    if cross {
+        return vec![one("cross.png", 0, Lines::Both)];
+    }
+    vec![one("along_x.png", 1, Lines::CrossedByY), one("along_y.png", 0, Lines::CrossedByX)]
+}
+
+/// Writes them with noise, and says where they are.
+fn record(folder: &Path, size: [usize; 2], all: &[(&'static str, Vec<f64>)], seed: u64) -> Vec<PathBuf> {
     println!("noise seed {seed}");
     let mut noise = Noise::new(seed);
-    let all: &[(&str, Pose, Lines)] = if cross {
-        &[("cross.png", poses[0], Lines::Both)]
-    } else {
-        &[("along_x.png", poses[1], Lines::CrossedByY), ("along_y.png", poses[0], Lines::CrossedByX)]
+    let one = |(name, brightness): &(&'static str, Vec<f64>)| {
+        let path = folder.join(name);
+        save(&path, size, grey(brightness, &mut noise));
+        path
     };
-    all.iter()
-        .map(|(name, pose, lines)| {
-            let path = folder.join(name);
-            save(&path, scene.size, grey(&scene.brightness(pose, *lines), &mut noise));
-            path
-        })
-        .collect()
+    all.iter().map(one).collect()
+}
+
+fn images(folder: &Path, scene: &Scene, poses: [Pose; 2], cross: bool, seed: u64) -> Vec<PathBuf> {
+    record(folder, scene.size, &exposures(scene, poses, cross), seed)
 }
 
 /// A pixel's ideal position by the map, and the target's true phases there.
@@ -144,7 +153,14 @@ fn check(scene: &Scene, cross: bool, one_pose: bool, limit: f64) -> Outcome {
     let [tx, ty] = found.left.total_px();
     println!(
         "{:?}: e {:.3?} px RMS, left by Brown {:.4?}, by the map {:.4} and {:.4} px (stated {tx:.4}, {ty:.4}: {:?}), in the border {:.4} and {:.4}",
-        found.pose, found.rms_px, found.brown.left_px, rms(&x), rms(&y), found.left, rms(&bx), rms(&by)
+        found.pose,
+        found.rms_px,
+        found.brown.left_px,
+        rms(&x),
+        rms(&y),
+        found.left,
+        rms(&bx),
+        rms(&by)
     );
     println!("  brown {:?} ± {:?}", found.brown.brown, found.brown.sigma);
     assert!(inside.len() > scene.size[0] * scene.size[1] / 49 / 2, "{}", inside.len());
@@ -216,8 +232,9 @@ fn stated_uncertainty_is_the_scatter_of_repeats() {
     let scene = Scene::usual([360, 280], 60.0);
     for (cross, pose) in [(false, [POSE, OTHER]), (true, [POSE, POSE])] {
         let mut all = Vec::new();
+        let clean = exposures(&scene, pose, cross);
         for seed in 0..REPEATS as u64 {
-            let images = images(folder.path(), &scene, pose, cross, 100 + seed);
+            let images = record(folder.path(), scene.size, &clean, 100 + seed);
             all.push(calibrate(&options(images, folder.path())).unwrap().found);
         }
         let grid = *all[0].map.grid();
@@ -228,8 +245,7 @@ fn stated_uncertainty_is_the_scatter_of_repeats() {
             let e: Vec<[f64; 2]> = all.iter().map(|f| f.map.e_px(at).unwrap()).collect();
             for i in 0..2 {
                 let mean = e.iter().map(|e| e[i]).sum::<f64>() / REPEATS as f64;
-                let scatter =
-                    e.iter().map(|e| (e[i] - mean).powi(2)).sum::<f64>() / (REPEATS - 1) as f64;
+                let scatter = e.iter().map(|e| (e[i] - mean).powi(2)).sum::<f64>() / (REPEATS - 1) as f64;
                 let stated = all.iter().map(|f| f.sigma_px[k][i].powi(2)).sum::<f64>() / REPEATS as f64;
                 if all.iter().all(|f| f.measured[k]) {
                     ratio[i] += scatter / stated;
@@ -251,10 +267,9 @@ fn stated_uncertainty_is_the_scatter_of_repeats() {
 
 /// Optics of the golden set-up on a sensor a quarter as wide.
 fn small_optics(folder: &Path, brown: bool) -> (PathBuf, Optics) {
-    let text = std::fs::read_to_string(
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/golden-macro.toml"),
-    )
-    .unwrap();
+    let text =
+        std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/golden-macro.toml"))
+            .unwrap();
     let mut text = text
         .replace("17956.216577540104 px", "4434 px")
         .replace("\"1295.5 px\", \"971.5 px\"", "\"319.5 px\", \"239.5 px\"");
@@ -353,8 +368,13 @@ fn maps_through_the_grating_serve_either_decoder() {
             })
             .collect();
         let chord = raw[6] - raw[0];
-        let before = raw.iter().map(|p| ((p - raw[0]).cross(&chord) / chord.norm()).norm()).fold(0.0, f64::max);
-        println!("{view:?}: a line is {:.2} µm off a chord, {:.2} µm without the map", 1e3 * off, 1e3 * before);
+        let before =
+            raw.iter().map(|p| ((p - raw[0]).cross(&chord) / chord.norm()).norm()).fold(0.0, f64::max);
+        println!(
+            "{view:?}: a line is {:.2} µm off a chord, {:.2} µm without the map",
+            1e3 * off,
+            1e3 * before
+        );
         assert!(off < 0.5 * before.max(1e-3));
     }
 }
@@ -399,7 +419,8 @@ fn bad_input_is_named() {
     let mm = scene.pitch * 416.0 / parameters.camera.focal_px;
     for (factor, warned) in [(1.0, 0), (1.01, 2)] {
         let target_pitch_mm = Some(factor * mm);
-        let o = Options { optics: Some(optics.clone()), target_pitch_mm, ..options(good.clone(), folder.path()) };
+        let o =
+            Options { optics: Some(optics.clone()), target_pitch_mm, ..options(good.clone(), folder.path()) };
         let warnings = calibrate(&o).unwrap().warnings;
         assert_eq!(warnings.len(), warned, "{warnings:?}");
         assert!(warnings.iter().all(|w| matches!(w, Warning::Scale { .. })));
@@ -425,7 +446,11 @@ fn bad_input_is_named() {
         .collect();
     save(&path("bright.png"), size, bright);
     let outcome = with(&[path("bright.png"), good[0].clone()]).unwrap();
-    assert!(matches!(&outcome.warnings[..], [Warning::Saturated { share, .. }] if *share > 0.2), "{:?}", outcome.warnings);
+    assert!(
+        matches!(&outcome.warnings[..], [Warning::Saturated { share, .. }] if *share > 0.2),
+        "{:?}",
+        outcome.warnings
+    );
 }
 
 #[test]

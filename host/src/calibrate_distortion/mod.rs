@@ -93,13 +93,17 @@ pub enum Warning {
         ratio: f64,
     },
     /// See [`DistortionWarning::PartsLeftOut`].
-    #[error("parts of the target ({pixels} nodes) are cut off from the rest and were left out: their whole lines cannot be counted")]
+    #[error(
+        "parts of the target ({pixels} nodes) are cut off from the rest and were left out: their whole lines cannot be counted"
+    )]
     PartsLeftOut {
         /// Nodes.
         pixels: usize,
     },
     /// A map through the grating without the optics.
-    #[error("no --optics given: this map is counted from a pinhole and goes with the decoders `linear` and `closed`, not with `ray`")]
+    #[error(
+        "no --optics given: this map is counted from a pinhole and goes with the decoders `linear` and `closed`, not with `ray`"
+    )]
     NotForRays,
 }
 
@@ -290,8 +294,11 @@ fn ideal(options: &Options, optics: Option<&Optics>, [w, h]: [u32; 2]) -> Result
 
 fn region(options: &Options, [width, height]: [u32; 2]) -> Result<Rectangle, Error> {
     let half = width / 2;
-    let whole = |x: u32, width: u32| {
-        Rectangle { x: x as usize, y: 0, width: width as usize, height: height as usize }
+    let whole = |x: u32, width: u32| Rectangle {
+        x: x as usize,
+        y: 0,
+        width: width as usize,
+        height: height as usize,
     };
     let Some([x, y, w, h]) = options.region else {
         return Ok(match options.view {
@@ -364,7 +371,8 @@ fn scale(
 
 fn listed(terms: [&'static [&'static str]; 3]) -> Vec<String> {
     let [x, y, both] = terms;
-    let one = |name: &str, terms: &[&str]| (!terms.is_empty()).then(|| format!("{name}: {}", terms.join(", ")));
+    let one =
+        |name: &str, terms: &[&str]| (!terms.is_empty()).then(|| format!("{name}: {}", terms.join(", ")));
     [one("e_x", x), one("e_y", y), one("(e_x, e_y)", both)].into_iter().flatten().collect()
 }
 
@@ -423,9 +431,8 @@ fn maps(found: &DistortionCalibration) -> Vec<FloatMap> {
         data,
         axes: axes.clone(),
     };
-    let e: Vec<[f64; 2]> = (0..nx * ny)
-        .map(|k| found.map.e_px(grid.node_px(k % nx, k / nx)).unwrap_or([f64::NAN; 2]))
-        .collect();
+    let e: Vec<[f64; 2]> =
+        (0..nx * ny).map(|k| found.map.e_px(grid.node_px(k % nx, k / nx)).unwrap_or([f64::NAN; 2])).collect();
     let component = |v: &[[f64; 2]], i: usize| v.iter().map(|v| v[i]).collect::<Vec<f64>>();
     vec![
         one("e_x", "px", component(&e, 0)),

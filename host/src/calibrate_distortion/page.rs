@@ -42,7 +42,8 @@ fn section(all: &[FloatMap], along_x: bool) -> Chart {
         (0..ny).map(|j| (a.y0 + a.dy * j as f64, j * nx + nx / 2)).collect()
     };
     let measured = |k: usize, v: f64| if all[6].data[k] > 0.5 { v } else { f64::NAN };
-    let of = |map: usize| nodes.iter().map(|(p, k)| (*p, measured(*k, all[map].data[*k]))).collect::<Vec<_>>();
+    let of =
+        |map: usize| nodes.iter().map(|(p, k)| (*p, measured(*k, all[map].data[*k]))).collect::<Vec<_>>();
     let with_sigma = |name: &str, e: usize, sigma: usize| Series {
         sigma: nodes.iter().map(|(_, k)| all[sigma].data[*k]).collect(),
         ..Series::new(name, SeriesStyle::Line, of(e))

@@ -101,7 +101,8 @@ pub fn calibrate(arguments: &DistortionArgs, output: &Output) -> Result<Answer, 
     line("  between the nodes", summary.left_between_nodes_px);
     line("  detail that the window takes off", summary.left_window_px);
     let b = &summary.brown;
-    let terms = [("k1", b.terms.k1), ("k2", b.terms.k2), ("k3", b.terms.k3), ("p1", b.terms.p1), ("p2", b.terms.p2)];
+    let terms =
+        [("k1", b.terms.k1), ("k2", b.terms.k2), ("k3", b.terms.k3), ("p1", b.terms.p1), ("p2", b.terms.p2)];
     for ((name, value), sigma) in terms.into_iter().zip(b.sigma) {
         if let Some(sigma) = sigma {
             writeln!(text, "{name} {value:.6e} ± {sigma:.1e} (F = {:.1} px)", b.focal_px).ok();

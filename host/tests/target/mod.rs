@@ -49,7 +49,8 @@ impl Scene {
         let [w, h] = size.map(|s| s as f64);
         let focal = 6.7 * w;
         let corner = 0.5 * w.hypot(h) / focal;
-        let spread = [(0.17, 0.23), (0.5, 0.3), (0.8, 0.2), (0.3, 0.7), (0.62, 0.62), (0.85, 0.8), (0.12, 0.85)];
+        let spread =
+            [(0.17, 0.23), (0.5, 0.3), (0.8, 0.2), (0.3, 0.7), (0.62, 0.62), (0.85, 0.8), (0.12, 0.85)];
         let defects = spread
             .into_iter()
             .enumerate()
@@ -174,9 +175,8 @@ fn harmonic(m: i32) -> f64 {
 const MOST: i32 = 9;
 
 fn line(t: f64, slope: [f64; 2]) -> f64 {
-    let wave = |m: i32| {
-        2.0 * harmonic(m) * passed(slope.map(|s| s * f64::from(m))) * (TAU * f64::from(m) * t).cos()
-    };
+    let wave =
+        |m: i32| 2.0 * harmonic(m) * passed(slope.map(|s| s * f64::from(m))) * (TAU * f64::from(m) * t).cos();
     0.5 + (1..=MOST).step_by(2).map(wave).sum::<f64>()
 }
 

@@ -56,7 +56,8 @@ impl MapGrid {
 
     /// The node nearest to a pixel, row by row, or nothing outside the grid.
     pub fn nearest(&self, pixel_px: [f64; 2]) -> Option<usize> {
-        let place = |i: usize| ((pixel_px[i] - self.origin_px[i]) / self.step_px[i]).round().max(0.0) as usize;
+        let place =
+            |i: usize| ((pixel_px[i] - self.origin_px[i]) / self.step_px[i]).round().max(0.0) as usize;
         self.contains(pixel_px)
             .then(|| place(1).min(self.nodes[1] - 1) * self.nodes[0] + place(0).min(self.nodes[0] - 1))
     }
@@ -174,7 +175,8 @@ pub(crate) struct Influence<'a> {
 impl Influence<'_> {
     /// Change of the map per change of the sample's value.
     pub(crate) fn weight(&self, sample: &MapSample) -> f64 {
-        let sum: f64 = basis(self.grid, sample.pixel_px).iter().map(|(a, v)| v * self.by_coefficient[*a]).sum();
+        let sum: f64 =
+            basis(self.grid, sample.pixel_px).iter().map(|(a, v)| v * self.by_coefficient[*a]).sum();
         sum / (sample.sigma_px * sample.sigma_px)
     }
 }

@@ -20,11 +20,8 @@ pub struct BrownFit {
 }
 
 /// Terms tried, each more after the one before: k2 and k3 only if they come out as significant.
-const LADDER: [[bool; 5]; 3] = [
-    [true, false, false, true, true],
-    [true, true, false, true, true],
-    [true, true, true, true, true],
-];
+const LADDER: [[bool; 5]; 3] =
+    [[true, false, false, true, true], [true, true, false, true, true], [true, true, true, true, true]];
 /// Significant: this many standard deviations.
 const SIGNIFICANT: f64 = 3.0;
 

@@ -70,10 +70,8 @@ impl Prediction {
         let coefficients = std::array::from_fn(|k| Dual::<7>::variable(b[k], 2 + k));
         let constant = |v| Dual { value: v, gradient: [0.0; 7] };
         let lens = CameraModel::of(constant(f), [constant(cx), constant(cy)], coefficients);
-        let q = [
-            Dual::<7>::variable((straight[0] - cx) / f, 0),
-            Dual::<7>::variable((straight[1] - cy) / f, 1),
-        ];
+        let q =
+            [Dual::<7>::variable((straight[0] - cx) / f, 0), Dual::<7>::variable((straight[1] - cy) / f, 1)];
         let seen = lens.pixel(q);
         let d = seen.map(|s| [s.gradient[0] / f, s.gradient[1] / f]);
         let chain = |row: [f64; 2]| [0, 1].map(|j| row[0] * by_plane[0][j] + row[1] * by_plane[1][j]);
@@ -135,15 +133,13 @@ impl Carrier {
         let centre = [0, 1].map(|i| mean(&|s| s.0[i]));
         let turns_centre = [0, 1].map(|i| mean(&|s| s.1[i]));
         let scale = mean(&|s| (s.0[0] - centre[0]).hypot(s.0[1] - centre[1]));
-        let product = |i: usize, j: usize| {
-            mean(&|s| (s.0[i] - centre[i]) * (s.0[j] - centre[j]) / (scale * scale))
-        };
+        let product =
+            |i: usize, j: usize| mean(&|s| (s.0[i] - centre[i]) * (s.0[j] - centre[j]) / (scale * scale));
         let m = [[product(0, 0), product(0, 1)], [product(0, 1), product(1, 1)]];
         let mut turns_scale = [1.0; 2];
         let mut h = vec![0.0; if pose == TargetPose::Common { 8 } else { 10 }];
         for k in 0..2 {
-            let r = [0, 1]
-                .map(|i| mean(&|s| (s.0[i] - centre[i]) / scale * (s.1[k] - turns_centre[k])));
+            let r = [0, 1].map(|i| mean(&|s| (s.0[i] - centre[i]) / scale * (s.1[k] - turns_centre[k])));
             let slope = solve2(m, r).ok_or_else(|| undetermined.clone())?;
             let size = slope[0].hypot(slope[1]);
             if !(size > 0.0 && size.is_finite()) {
@@ -165,9 +161,8 @@ impl Carrier {
     fn plane(&self, turns: [f64; 2]) -> Option<([f64; 2], [f64; 2], [[f64; 2]; 2])> {
         let t = [0, 1].map(|k| (turns[k] - self.turns_centre[k]) / self.turns_scale[k]);
         let den = self.denominators();
-        let a = [0, 1].map(|k| {
-            [self.h[3 * k] - t[k] * self.h[den[k]], self.h[3 * k + 1] - t[k] * self.h[den[k] + 1]]
-        });
+        let a = [0, 1]
+            .map(|k| [self.h[3 * k] - t[k] * self.h[den[k]], self.h[3 * k + 1] - t[k] * self.h[den[k] + 1]]);
         let q = solve2(a, [0, 1].map(|k| t[k] - self.h[3 * k + 2]))?;
         let first = solve2(a, [1.0, 0.0])?;
         let second = solve2(a, [0.0, 1.0])?;
@@ -186,7 +181,12 @@ impl Carrier {
     }
 
     /// e = observed − predicted.
-    pub(super) fn distortion(&self, s: &Sample, prediction: &Prediction, brown: &Brown) -> Option<Distortion> {
+    pub(super) fn distortion(
+        &self,
+        s: &Sample,
+        prediction: &Prediction,
+        brown: &Brown,
+    ) -> Option<Distortion> {
         let (q, t, inverse) = self.plane(s.turns)?;
         let plane = [0, 1].map(|i| self.centre[i] + self.scale * q[i]);
         let seen = prediction.pixel(plane, brown)?;

@@ -257,9 +257,7 @@ pub struct Left {
 impl Left {
     /// All together.
     pub fn total_px(&self) -> [f64; 2] {
-        [0, 1].map(|i| {
-            self.between_nodes_px[i].hypot(self.noise_px[i]).hypot(self.window_px[i])
-        })
+        [0, 1].map(|i| self.between_nodes_px[i].hypot(self.noise_px[i]).hypot(self.window_px[i]))
     }
 }
 
