@@ -92,6 +92,36 @@ pub enum Error {
     /// The rig could not be calibrated.
     #[error("no calibration of the rig: {0}")]
     CalibrateRig(#[from] daic_optics::RigError),
+    /// The distortion could not be calibrated.
+    #[error("no calibration of the distortion: {0}")]
+    CalibrateDistortion(#[from] daic_optics::DistortionError),
+    /// An image of a line target without usable phases.
+    #[error("{}: no phases of a line target: {source}", path.display())]
+    TargetPhase {
+        /// The image.
+        path: PathBuf,
+        /// Why.
+        source: daic_correlate::phase::PhaseError,
+    },
+    /// Neither one image nor two.
+    #[error(
+        "{found} images of a target given: give one of a cross grating, or two, of lines along x and of lines along y"
+    )]
+    TargetImages {
+        /// Images given.
+        found: usize,
+    },
+    /// Rays through the grating were asked for without what they need.
+    #[error("--ideal ray traces rays through the grating: it needs --optics FILE and --view minus or plus")]
+    IdealRay,
+    /// A file of a distortion map that cannot be used.
+    #[error("{} is no usable distortion map: {reason}; write it anew with `daic calibrate distortion`", path.display())]
+    DistortionFile {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, with the field's name.
+        reason: String,
+    },
     /// A row of a table of tracked points or moves that cannot be used.
     #[error("{}, row {row}: {column} is {value}, it must be {allowed}", path.display())]
     TrackedPoint {

@@ -11,6 +11,7 @@
 //! * [`pair`]: plain 2D-DIC of two images; [`strain`] and [`probe`] work on its results, [`noise_floor`]
 //!   says what such a measurement can resolve.
 //! * [`phase`]: phases of gratings and displacements from them.
+//! * [`calibrate_distortion`]: images of a line target become a distortion map.
 //! * [`calibrate_rig`]: points tracked on a plate become an optics file.
 //! * [`calibrate_camera`]: a camera from images of a board; [`align`]: lining up a rig.
 //! * [`sequence`]: the same of a series of images.
@@ -19,6 +20,7 @@
 pub mod align;
 pub mod area;
 pub mod calibrate_camera;
+pub mod calibrate_distortion;
 pub mod calibrate_rig;
 pub mod camera_file;
 #[cfg(feature = "sim")]

@@ -216,6 +216,17 @@ pub enum WindowArg {
     BiTriangular,
 }
 
+impl WindowArg {
+    pub fn kind(self) -> daic_correlate::phase::WindowKind {
+        use daic_correlate::phase::WindowKind;
+        match self {
+            Self::Gaussian => WindowKind::Gaussian,
+            Self::GaussianFlat => WindowKind::GaussianFlat,
+            Self::BiTriangular => WindowKind::BiTriangular,
+        }
+    }
+}
+
 /// Which pixels are used.
 #[derive(Debug, Args)]
 pub struct AreaArgs {

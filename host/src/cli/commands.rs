@@ -3,7 +3,7 @@
 use super::arguments::{
     AreaArgs, CorrelateArgs, CriterionArg, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, GratingsArg,
     GuessArg, InitArgs, InterpolationArg, PhaseArgs, ProcessArgs, ProfileArgs, Roi, RunArgs, ShapeArg,
-    SolverArg, UpdateArg, WindowArg,
+    SolverArg, UpdateArg,
 };
 #[cfg(feature = "sim")]
 use super::arguments::{DemoArgs, SimulateArgs};
@@ -272,13 +272,9 @@ fn correlate_sequence(arguments: &CorrelateArgs, output: &Output) -> Result<Answ
 }
 
 pub fn phase(arguments: &PhaseArgs, output: &Output) -> Result<Answer, Error> {
-    use daic_correlate::phase::{Gratings, PhaseSettings, WindowKind};
+    use daic_correlate::phase::{Gratings, PhaseSettings};
     let settings = PhaseSettings {
-        window: match arguments.window {
-            WindowArg::Gaussian => WindowKind::Gaussian,
-            WindowArg::GaussianFlat => WindowKind::GaussianFlat,
-            WindowArg::BiTriangular => WindowKind::BiTriangular,
-        },
+        window: arguments.window.kind(),
         width: arguments.width,
         gratings: match arguments.gratings {
             GratingsArg::Auto => Gratings::Auto,

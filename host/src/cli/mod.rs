@@ -3,6 +3,7 @@
 mod align;
 mod arguments;
 mod calibrate;
+mod calibrate_distortion;
 mod calibrate_rig;
 mod camera;
 mod commands;
