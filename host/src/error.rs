@@ -6,6 +6,33 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
+    /// Live matching of a mosaic sensor.
+    #[error(
+        "live matching takes whole images: take the pixels of one channel out of each frame first (Lattice::of)"
+    )]
+    LiveMosaic,
+    /// An option that the demo's scene does not have.
+    #[error("{reason}")]
+    DemoOption {
+        /// What, and what is allowed.
+        reason: String,
+    },
+    /// An experiment under the microscope, where the macro set-up's optics are wanted.
+    #[error("this experiment describes a microscope: it has no [optics]")]
+    NoOptics,
+    /// The microscope's frames have been measured without a calibration.
+    #[error(
+        "a microscope is calibrated by its own moves: give frames with role = \"calibration\" (a z move and an in-plane move) and processing.calibrate = true"
+    )]
+    NoMoves,
+    /// The moves of a dataset leave parameters of the microscope open.
+    #[error("the calibration frames leave open: {}; add {}", open.join(", "), add.join(" and "))]
+    MovesOpen {
+        /// Parameters that are not determined.
+        open: Vec<&'static str>,
+        /// Motions that would determine them.
+        add: Vec<&'static str>,
+    },
     /// An experiment or optics file.
     #[error(transparent)]
     Config(#[from] daic_rig::experiment::ConfigError),
@@ -388,6 +415,9 @@ pub enum Error {
     /// The calibration of a microscope.
     #[error("the calibration failed: {0}")]
     CalibrateMicroscope(#[from] daic_optics::microscope::calibrate::CalibrateError),
+    /// A parameter that no microscope has.
+    #[error("microscope: {0}")]
+    Microscope(#[from] daic_optics::microscope::MicroscopeError),
     /// A file of motions or of a microscope.
     #[error(transparent)]
     MicroscopeFile(#[from] crate::microscope::MicroscopeFileError),

@@ -9,6 +9,14 @@ use daic_rig::units::{Angle, Length, Pixels};
 use nalgebra::DMatrix;
 use std::path::Path;
 
+/// The `[optics]` of an experiment.
+///
+/// # Errors
+/// [`Error::NoOptics`] for an experiment under the microscope.
+pub fn of(experiment: &experiment::Experiment) -> Result<&experiment::Optics, Error> {
+    experiment.optics.as_ref().ok_or(Error::NoOptics)
+}
+
 /// The optics that a checked section describes.
 ///
 /// # Errors

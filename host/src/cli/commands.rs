@@ -3,10 +3,10 @@
 use super::arguments::{
     AreaArgs, CorrelateArgs, CriterionArg, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, GratingsArg,
     GuessArg, InitArgs, InterpolationArg, PhaseArgs, ProcessArgs, ProfileArgs, Roi, RunArgs, ShapeArg,
-    SolverArg, UpdateArg,
+    SolverArg, TrackArgs, UpdateArg,
 };
 #[cfg(feature = "sim")]
-use super::arguments::{DemoArgs, SimulateArgs};
+use super::arguments::{DemoArgs, SceneArg, SimulateArgs};
 use super::output::{Answer, Output};
 use daic::area::{self, Area};
 use daic::measure::{self, Rectangle, Reference};
@@ -25,10 +25,15 @@ use std::path::Path;
 
 #[cfg(feature = "sim")]
 pub fn demo(arguments: &DemoArgs, output: &Output) -> Result<Answer, Error> {
+    let scene = match arguments.scene {
+        SceneArg::Macro => daic::demo::Scene::Macro,
+        SceneArg::Microscope => daic::demo::Scene::Microscope,
+    };
     let options = daic::demo::Options {
+        scene,
         out: arguments.out.clone(),
         seed: arguments.seed,
-        move_mm: arguments.r#move.0,
+        move_mm: arguments.move_mm().map_err(|reason| Error::DemoOption { reason })?,
         pitch_factor: arguments.pitch_factor,
         calibrate: !arguments.no_calibration,
     };
@@ -434,8 +439,9 @@ fn decoder(decoder: DecoderArg) -> Decoder {
     }
 }
 
-fn measure_settings(arguments: &DicArgs) -> measure::Settings {
-    let mut settings = measure::Settings::default();
+fn measure_settings(arguments: &DicArgs, bayer: Option<experiment::Bayer>) -> measure::Settings {
+    let lattice = daic::settings::lattice(bayer);
+    let mut settings = measure::Settings { lattice, ..measure::Settings::default() };
     apply(arguments, &mut settings.dic, &mut settings.step);
     settings
 }
@@ -451,7 +457,7 @@ fn make_folder(path: &Path) -> Result<(), Error> {
 pub fn profile(arguments: &ProfileArgs, output: &Output) -> Result<Answer, Error> {
     let model = model(&arguments.optics)?;
     let frame = images::read(&arguments.frame)?;
-    let settings = measure_settings(&arguments.dic);
+    let settings = measure_settings(&arguments.dic, arguments.bayer);
     let reference = Reference::new(&frame, &model, &settings, output)?;
     let decoder = decoder(arguments.decoder);
     let profile = measure::profile(&reference.grid, &reference.matches, &model, decoder).with_points()?;
@@ -477,7 +483,7 @@ pub fn profile(arguments: &ProfileArgs, output: &Output) -> Result<Answer, Error
 pub fn displacement(arguments: &DisplacementArgs, output: &Output) -> Result<Answer, Error> {
     let model = model(&arguments.optics)?;
     let (frame, deformed) = images::read_pair(&arguments.reference, &arguments.deformed)?;
-    let settings = measure_settings(&arguments.dic);
+    let settings = measure_settings(&arguments.dic, arguments.bayer);
     let reference = Reference::new(&frame, &model, &settings, output)?;
     let tracks = reference.track(&deformed, output)?;
     let decoder = decoder(arguments.decoder);
@@ -506,12 +512,38 @@ pub fn displacement(arguments: &DisplacementArgs, output: &Output) -> Result<Ans
     Ok(Answer::new(as_json(&summary)?, text))
 }
 
+pub fn track(arguments: &TrackArgs, output: &Output) -> Result<Answer, Error> {
+    let mut settings = measure_settings(&arguments.dic, arguments.bayer);
+    if let Some(roi) = arguments.roi {
+        settings.roi = Some(rectangle(roi, &images::read(&arguments.reference)?)?);
+    }
+    let options = daic::microscope::TrackOptions {
+        reference: arguments.reference.clone(),
+        frames: arguments.frames.clone(),
+        search_px: arguments.search,
+        settings,
+        out: arguments.out.clone(),
+    };
+    let found = daic::microscope::track(&options, output)?;
+    let mut text = String::new();
+    for t in &found {
+        let [a, b, c, d] = t.mean_px;
+        let (frame, ok, points, field) = (&t.frame, t.ok, t.points, &t.field);
+        writeln!(text, "{frame}: {ok} of {points} points, −1 view ({a:.3}, {b:.3}) px, +1 view ({c:.3}, {d:.3}) px (mean) -> {field}").ok();
+    }
+    text.push_str("next: name the fields in a file of moves for daic calibrate microscope");
+    let all = found.iter().all(|t| t.ok > 0);
+    Ok(Answer::new(json!({ "frames": as_json(&found)? }), text).checked(all))
+}
+
 pub fn init(arguments: &InitArgs) -> Result<Answer, Error> {
     let path = &arguments.file;
     if path.exists() && !arguments.force {
         return Err(Error::Exists { path: path.clone() });
     }
-    atomic::write_bytes(path, experiment::template().as_bytes())?;
+    let template =
+        if arguments.microscope { experiment::microscope_template() } else { experiment::template() };
+    atomic::write_bytes(path, template.as_bytes())?;
     let text = format!("wrote {0}\nnext: daic simulate {0} --out dataset", path.display());
     Ok(Answer::new(json!({ "file": path.display().to_string() }), text))
 }

@@ -62,6 +62,7 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Phase(arguments) => commands::phase(arguments, output),
         Command::Profile(arguments) => commands::profile(arguments, output),
         Command::Displacement(arguments) => commands::displacement(arguments, output),
+        Command::Track(arguments) => commands::track(arguments, output),
         Command::Calibrate(arguments) => calibrate::calibrate(arguments, output),
         Command::Plan(arguments) => plan::plan(arguments),
         Command::Align(arguments) => align::align(arguments),

@@ -5,7 +5,7 @@ use super::{Grid, Match, Profile, Rectangle, Reference, Settings, profile};
 use crate::error::Error;
 use crate::progress::Progress;
 use daic_correlate::{Guess, Image, Points, Reference as Subsets, Roi, ShapeParameters, Target, Workspace};
-use daic_dataset::GreyImage;
+use daic_dataset::{GreyImage, Lattice};
 use daic_optics::{Decoder, OpticalModel};
 
 /// Pixels around the views that are kept, so that the matched view may move.
@@ -45,7 +45,8 @@ impl Live {
     /// Finds and matches the views of a first frame.
     ///
     /// # Errors
-    /// As [`Reference::new`]; [`Error::NothingMeasured`] where no point was matched.
+    /// As [`Reference::new`]; [`Error::NothingMeasured`] where no point was matched; [`Error::LiveMosaic`] for a
+    /// channel of a mosaic sensor.
     pub fn new(
         frame: &GreyImage,
         model: &OpticalModel,
@@ -53,6 +54,9 @@ impl Live {
         settings: &Settings,
         progress: &dyn Progress,
     ) -> Result<Self, Error> {
+        if settings.lattice != Lattice::ALL {
+            return Err(Error::LiveMosaic);
+        }
         let first = Reference::new(frame, model, settings, progress)?;
         profile(&first.grid, &first.matches, model, decoder).with_points()?;
         let mut shifts: Vec<[f64; 2]> = first
@@ -143,7 +147,7 @@ impl Live {
         self.matches.clear();
         for (p, last) in found.points.iter().zip(&mut self.last) {
             *last = p.status.is_ok().then_some(p.shape);
-            let mut m = match_of(p);
+            let mut m = match_of(p, Lattice::ALL);
             for c in 0..2 {
                 let at = [r.x, r.y][c] as f64;
                 m.pair.minus_px[c] += at;

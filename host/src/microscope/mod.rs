@@ -3,10 +3,13 @@
 //! A file of moves ([`Moves`]) names for each known motion a CSV file with the image displacements of
 //! its points; the result is a [`MicroscopeFile`].
 
+mod decode;
 mod field;
 mod file;
+mod known;
 mod moves;
 mod report;
+mod track;
 
 use crate::error::Error;
 use daic_optics::microscope::calibrate::{
@@ -16,9 +19,12 @@ use daic_optics::microscope::{Candidate, Form, Quantity};
 use serde::Serialize;
 use std::path::Path;
 
+pub use decode::{displacement, profile};
 pub use file::{Fit, FittedMotion, MicroscopeFile, MicroscopeSection};
+pub use known::{CalibratedModel, KnownMove, MoveSettings, from_moves};
 pub use moves::{Component, Correlation, MotionEntry, Moves};
 pub use report::page;
+pub use track::{Tracked, TrackOptions, track};
 
 /// What is wrong with a file of moves, of fields or of a microscope.
 #[derive(Debug, thiserror::Error)]

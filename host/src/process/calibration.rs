@@ -83,14 +83,14 @@ pub fn run(
         .iter()
         .map(|e| CalibratedParameter {
             name: unit_name(e.parameter).to_owned(),
-            start: e.start,
+            start: Some(e.start),
             value: e.value,
             sigma: e.sigma * shared.sqrt(),
         })
         .collect();
     parameters.push(CalibratedParameter {
         name: unit_name(Parameter::GratingToReference).to_owned(),
-        start: start.grating_to_reference_mm,
+        start: Some(start.grating_to_reference_mm),
         value: optics.grating_to_reference_mm,
         sigma: datum_sigma(&found, &model, height_sigma) * shared.sqrt(),
     });

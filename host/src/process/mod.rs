@@ -4,6 +4,7 @@
 //! absent, and belong to a key over settings and input: a second run does what the first left.
 
 mod calibration;
+mod microscope;
 mod report;
 mod summary;
 
@@ -69,7 +70,7 @@ pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Proc
     let reference_record = reference_of(&records)
         .ok_or_else(|| Error::NoPairedFrame { root: root.to_owned(), frames: records.len() })?;
 
-    let settings = crate::settings::measure_settings(&experiment.processing);
+    let settings = crate::settings::measure_settings(&experiment);
     let mut run = Run {
         dataset: &dataset,
         experiment: &experiment,
@@ -81,13 +82,22 @@ pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Proc
         resumed: 0,
         failed: Vec::new(),
     };
-    let start = optics_section::from_section(&experiment.optics)?;
-    let (optics, calibration) = run.calibrated(&paired, &start)?;
-    write_optics(&dataset.results(), &experiment, &optics, calibration.as_ref())?;
-    let reference = run.profile(&optics)?;
+    let (instrument, calibration) = match &experiment.microscope {
+        Some(_) => {
+            let (model, calibration) = run.calibrated_microscope(&paired)?;
+            (Instrument::Microscope(model), Some(calibration))
+        }
+        None => {
+            let section = optics_section::of(&experiment)?;
+            let (optics, calibration) = run.calibrated(&paired, &optics_section::from_section(section)?)?;
+            write_optics(&dataset.results(), section, &optics, calibration.as_ref())?;
+            (Instrument::Macro(optics), calibration)
+        }
+    };
+    let reference = run.profile(&instrument)?;
     let mut measured = Vec::new();
     for record in paired.iter().filter(|r| r.role == FrameRole::Measurement) {
-        match run.displacement(record, &optics) {
+        match run.displacement(record, &instrument) {
             Ok(result) => measured.push(result),
             // one bad frame does not stop a series
             Err(error @ (Error::Dataset(_) | Error::NothingMeasured { .. } | Error::Correlate(_))) => {
@@ -186,6 +196,23 @@ fn count(records: &[FrameRecord]) -> FrameCounts {
     }
 }
 
+/// What makes points of pixel pairs.
+enum Instrument {
+    Macro(Optics),
+    Microscope(crate::microscope::CalibratedModel),
+}
+
+impl Instrument {
+    /// All that its results depend on.
+    fn settings(&self) -> Result<serde_json::Value, Error> {
+        let value = match self {
+            Self::Macro(optics) => serde_json::to_value(optics),
+            Self::Microscope(model) => serde_json::to_value(model),
+        };
+        value.map_err(|source| Error::Unwritable { path: "key".into(), reason: source.to_string() })
+    }
+}
+
 struct Run<'a> {
     dataset: &'a Dataset,
     experiment: &'a Experiment,
@@ -213,21 +240,27 @@ impl Run<'_> {
     fn reference(&mut self) -> Result<&Reference, Error> {
         if self.reference.is_none() {
             let frame = self.dataset.read_frame(self.reference_record)?;
-            let model = OpticalModel::new(&optics_section::from_section(&self.experiment.optics)?)?;
-            self.reference = Some(Reference::new(&frame, &model, &self.settings, self.progress)?);
+            let found = if let Some(microscope) = &self.experiment.microscope {
+                Reference::by_outlines(&frame, microscope.search.px(), &self.settings, self.progress)?
+            } else {
+                let optics = optics_section::from_section(optics_section::of(self.experiment)?)?;
+                Reference::new(&frame, &OpticalModel::new(&optics)?, &self.settings, self.progress)?
+            };
+            self.reference = Some(found);
         }
         self.reference.as_ref().ok_or(Error::Gratings)
     }
 
-    fn key(&self, optics: &Optics, records: &[&FrameRecord]) -> Result<String, Error> {
+    fn key(&self, optics: &impl Serialize, records: &[&FrameRecord]) -> Result<String, Error> {
         let files: Vec<_> = records
             .iter()
             .filter_map(|r| Some(self.dataset.root().join(r.file.as_ref()?)))
             // a file that is gone has its own error where it is read
             .filter(|file| file.exists())
             .collect();
-        let settings =
-            (&self.experiment.processing, optics, records.iter().map(|r| r.commanded_um).collect::<Vec<_>>());
+        let commanded: Vec<_> = records.iter().map(|r| r.commanded_um).collect();
+        let bayer = self.experiment.rig.camera.bayer;
+        let settings = (&self.experiment.processing, optics, commanded, bayer);
         Ok(result_key(env!("CARGO_PKG_VERSION"), &settings, &files)?)
     }
 
@@ -284,9 +317,9 @@ impl Run<'_> {
         Ok((optics, Some(summary)))
     }
 
-    fn profile(&mut self, optics: &Optics) -> Result<ReferenceResult, Error> {
+    fn profile(&mut self, instrument: &Instrument) -> Result<ReferenceResult, Error> {
         let record = self.reference_record;
-        let key = self.key(optics, &[record])?;
+        let key = self.key(&instrument.settings()?, &[record])?;
         let directory = self.dataset.frame_results(record.id);
         if !self.fresh
             && self.dataset.is_done(record.id, &key)
@@ -295,10 +328,18 @@ impl Run<'_> {
             self.resumed += 1;
             return Ok(done);
         }
-        let model = OpticalModel::new(optics)?;
         let decoder = crate::settings::decoder(self.experiment.processing.decoder);
         let reference = self.reference()?;
-        let profile = measure::profile(&reference.grid, &reference.matches, &model, decoder).with_points()?;
+        let profile = match instrument {
+            Instrument::Macro(optics) => {
+                let model = OpticalModel::new(optics)?;
+                measure::profile(&reference.grid, &reference.matches, &model, decoder)
+            }
+            Instrument::Microscope(model) => {
+                crate::microscope::profile(&reference.grid, &reference.matches, &model.model()?)
+            }
+        }
+        .with_points()?;
         let corners = |r: measure::Rectangle| [r.x, r.y, r.width, r.height];
         let result = ReferenceResult {
             profile: profile_summary(&profile),
@@ -312,8 +353,8 @@ impl Run<'_> {
         Ok(result)
     }
 
-    fn displacement(&mut self, record: &FrameRecord, optics: &Optics) -> Result<FrameSummary, Error> {
-        let key = self.key(optics, &[self.reference_record, record])?;
+    fn displacement(&mut self, record: &FrameRecord, instrument: &Instrument) -> Result<FrameSummary, Error> {
+        let key = self.key(&instrument.settings()?, &[self.reference_record, record])?;
         let directory = self.dataset.frame_results(record.id);
         if !self.fresh
             && self.dataset.is_done(record.id, &key)
@@ -323,20 +364,21 @@ impl Run<'_> {
             return Ok(done);
         }
         let image = self.dataset.read_frame(record)?;
-        let model = OpticalModel::new(optics)?;
         let decoder = crate::settings::decoder(self.experiment.processing.decoder);
         let commanded_um = self.moved_um(record);
         let (progress, settings) = (self.progress, self.settings.clone());
         let reference = self.reference()?;
         let tracks = reference.track(&image, progress)?;
-        let displacement = measure::displacement(
-            &reference.grid,
-            &reference.matches,
-            &tracks,
-            &model,
-            decoder,
-            settings.height_mm,
-        )
+        let (grid, matches) = (&reference.grid, &reference.matches);
+        let displacement = match instrument {
+            Instrument::Macro(optics) => {
+                let model = OpticalModel::new(optics)?;
+                measure::displacement(grid, matches, &tracks, &model, decoder, settings.height_mm)
+            }
+            Instrument::Microscope(model) => {
+                crate::microscope::displacement(grid, matches, &tracks, &model.model()?)
+            }
+        }
         .with_points()?;
         let result = frame_summary(record, commanded_um, &displacement);
         let directory = self.dataset.begin_results(record.id)?;
@@ -420,7 +462,7 @@ fn run_begin(dataset: &Dataset) -> Result<Option<u64>, Error> {
 
 fn write_optics(
     directory: &Path,
-    experiment: &Experiment,
+    section: &daic_rig::experiment::Optics,
     optics: &Optics,
     calibration: Option<&CalibrationSummary>,
 ) -> Result<(), Error> {
@@ -433,7 +475,7 @@ fn write_optics(
         provenance: Some(provenance),
         date: None,
         covariance: None,
-        optics: optics_section::with_calibrated(&experiment.optics, optics),
+        optics: optics_section::with_calibrated(section, optics),
     };
     let path = directory.join("optics.toml");
     let text = file

@@ -112,9 +112,15 @@ pub fn report(
         sections.push(Section {
             title: "Calibration".to_owned(),
             text: vec![
-                "F and s follow from the commanded moves; d, which only says from where heights are counted, \
-                 from the height of the specimen on the optical axis that the experiment states."
-                    .to_owned(),
+                if experiment.microscope.is_some() {
+                    "β and the centre of perspective follow from the commanded moves, by least squares in image \
+                     space. Heights count from the mean of the reference surface. All residuals: \
+                     results/calibration/report.html."
+                } else {
+                    "F and s follow from the commanded moves; d, which only says from where heights are \
+                     counted, from the height of the specimen on the optical axis that the experiment states."
+                }
+                .to_owned(),
             ],
             tables: vec![table],
             figures: Vec::new(),
@@ -206,7 +212,7 @@ fn calibration_table(summary: &Summary) -> Option<TableBlock> {
         .map(|p| {
             vec![
                 Cell::Text(p.name.clone()),
-                Cell::Number(format!("{:.4}", p.start)),
+                Cell::Number(p.start.map_or_else(|| "—".to_owned(), |v| format!("{v:.4}"))),
                 Cell::Number(with_uncertainty(p.value, p.sigma, "")),
             ]
         })

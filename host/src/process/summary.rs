@@ -84,8 +84,8 @@ pub struct CalibrationSummary {
 pub struct CalibratedParameter {
     /// Name with unit.
     pub name: String,
-    /// What the experiment file said.
-    pub start: f64,
+    /// What the experiment file said, if it did.
+    pub start: Option<f64>,
     /// Estimate.
     pub value: f64,
     /// Its standard deviation.

@@ -1,7 +1,7 @@
 //! Rules between values: each finding names field, value and allowed range.
 
 use super::problem::Finding;
-use super::{Axis, Experiment, FrameStep, Grating, Optics, OpticsFile, Processing, Rig, Step, Strobe};
+use super::{Axis, Experiment, FrameStep, Grating, Microscope, Optics, OpticsFile, Processing, Rig, Step, Strobe};
 use crate::units::{Length, Time};
 use daic_protocol::{channels, limits::MAX_LOOP_DEPTH};
 use std::fmt::Display;
@@ -42,7 +42,14 @@ impl Findings {
 pub(super) fn experiment(e: &Experiment) -> Vec<Finding> {
     let mut f = Findings::default();
     rig(&e.rig, &mut f);
-    optics(&e.optics, &mut f);
+    match (&e.optics, &e.microscope) {
+        (Some(o), None) => optics(o, &mut f),
+        (None, Some(m)) => microscope(m, &mut f),
+        (Some(_), Some(_)) => {
+            f.require(false, "microscope", "given besides [optics]", "one of [optics] and [microscope]");
+        }
+        (None, None) => f.require(false, "optics", "left out", "one of [optics] and [microscope]"),
+    }
     processing(&e.processing, &mut f);
     sequence(e, &mut f);
     f.0
@@ -106,7 +113,12 @@ fn rig(rig: &Rig, f: &mut Findings) {
     f.time("rig.camera.exposure_delay", camera.exposure_delay, false);
     f.time("rig.camera.exposure", camera.exposure, true);
     f.time("rig.camera.readout", camera.readout, false);
-    let busy = camera.exposure_delay.ns() + camera.exposure.ns() + camera.readout.ns();
+    f.time("rig.camera.row_time", camera.row_time, false);
+    f.time("rig.camera.row_time, times the rows", camera.rolling(), false);
+    let busy = camera.exposure_delay.ns()
+        + camera.exposure.ns()
+        + camera.rolling().ns()
+        + camera.readout.ns();
     f.require(
         camera.trigger_width.ns() < busy,
         "rig.camera.trigger_width",
@@ -154,7 +166,7 @@ fn axis(field: &str, axis: &Axis, f: &mut Findings) {
     }
 }
 
-/// The strobe must lie inside the exposure.
+/// The strobe must lie where all rows are exposed.
 fn strobe(rig: &Rig, strobe: &Strobe, field: &str, f: &mut Findings) {
     f.require(
         strobe.led < channels::LEDS,
@@ -168,15 +180,32 @@ fn strobe(rig: &Rig, strobe: &Strobe, field: &str, f: &mut Findings) {
     if let Some(level) = strobe.level {
         f.require((0.0..=1.0).contains(&level), format!("{field}.level"), level, "0 to 1");
     }
-    let begin = rig.camera.exposure_delay.ns();
-    let end = begin + rig.camera.exposure.ns();
-    let inside = format!("inside the exposure, {begin} ns to {end} ns after the trigger");
+    let first = rig.camera.exposure_delay.ns();
+    let end = first + rig.camera.exposure.ns();
+    let rolling = rig.camera.rolling().ns();
+    let begin = first + rolling;
+    let inside = if rolling > 0.0 {
+        format!("where all rows are exposed, {begin} ns to {end} ns after the trigger (rolling shutter)")
+    } else {
+        format!("inside the exposure, {begin} ns to {end} ns after the trigger")
+    };
     f.require(strobe.delay.ns() >= begin, format!("{field}.delay"), strobe.delay, inside.clone());
     f.require(
         strobe.delay.ns() + strobe.width.ns() <= end,
         format!("{field}.width"),
         format!("{} (LED off {} ns after the trigger)", strobe.width, strobe.delay.ns() + strobe.width.ns()),
         inside,
+    );
+}
+
+fn microscope(m: &Microscope, f: &mut Findings) {
+    f.positive("microscope.pixel", m.pixel);
+    let search = m.search.px();
+    f.require(
+        (1.0..=10_000.0).contains(&search),
+        "microscope.search",
+        m.search,
+        "1 px to 10000 px",
     );
 }
 
