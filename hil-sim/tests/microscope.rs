@@ -52,7 +52,8 @@ fn pixels_and_points_belong_together() {
         let m = config.scene.microscope.as_ref().expect("set");
         let rays = RayMicroscope::new(&m.geometry(1440, 720)).expect("valid");
         let mut seen = 0;
-        for (view, other) in [(View::Minus, daic_optics::View::Minus), (View::Plus, daic_optics::View::Plus)] {
+        for (view, other) in [(View::Minus, daic_optics::View::Minus), (View::Plus, daic_optics::View::Plus)]
+        {
             for k in 0..400 {
                 let x = f64::from(k % 20) * 35.0 + if view == View::Plus { 720.0 } else { 0.0 };
                 let y = f64::from(k / 20) * 36.0;
@@ -63,7 +64,8 @@ fn pixels_and_points_belong_together() {
                 let off = (pixel[0] - x).hypot(pixel[1] - y);
                 // Rounding of numbers of 10 mm, magnified to pixels of 0.5 µm.
                 assert!(off < 1e-8, "{view:?} {x} {y}: {p:?} {pixel:?}");
-                let sphere = (0.68_f64.powi(2) - (p[0] - stage[0]).powi(2) - (p[1] - stage[1]).powi(2)).sqrt();
+                let sphere =
+                    (0.68_f64.powi(2) - (p[0] - stage[0]).powi(2) - (p[1] - stage[1]).powi(2)).sqrt();
                 assert!((p[2] - stage[2] - (sphere - 0.68 + 0.01)).abs() < 1e-12, "{p:?}");
             }
         }

@@ -48,7 +48,8 @@ fn the_spectrum_smears_the_views() {
     assert!((width(2.0) - 2.84).abs() < 0.005, "{}", width(2.0));
     for view in [View::Minus, View::Plus] {
         let [_, mono] = left_edge(&edge(|_| {}), view);
-        for (nm, shape) in [(2.0, SpectrumShape::Box), (10.0, SpectrumShape::Box), (2.0, SpectrumShape::Gaussian)]
+        for (nm, shape) in
+            [(2.0, SpectrumShape::Box), (10.0, SpectrumShape::Box), (2.0, SpectrumShape::Gaussian)]
         {
             let scene = edge(|c| {
                 c.scene.spectrum.width_mm = nm * 1e-6;
@@ -185,7 +186,8 @@ fn colour_filters_take_their_part() {
     ];
     let response = [1.0, 0.25, 0.05];
     for (pattern, cell) in cells {
-        let (filtered, _) = frame(&bare(|c| c.camera.bayer = Some(BayerConfig { pattern, response })), 0, 100 * us);
+        let (filtered, _) =
+            frame(&bare(|c| c.camera.bayer = Some(BayerConfig { pattern, response })), 0, 100 * us);
         let mut lit = 0;
         for (k, (&found, &bare)) in filtered.iter().zip(&plain).enumerate() {
             let (x, y) = (k % 324, k / 324);

@@ -170,8 +170,7 @@ pub fn complete(root: &Path, processed: &process::Processed) -> Result<Option<De
     let path = root.join("experiment.toml");
     let experiment = Experiment::parse(&dataset.experiment_toml()?, &path)?;
     let microscope = experiment.microscope.is_some();
-    let height_mm =
-        if microscope { simulated::microscope_height_mm } else { simulated::demo_height_mm };
+    let height_mm = if microscope { simulated::microscope_height_mm } else { simulated::demo_height_mm };
     let profile = profile_error_um(&dataset, height_mm)?;
     // under the microscope heights count from the mean of the surface
     let profile_rms_um = if microscope { profile.std } else { profile.rms };
@@ -261,9 +260,8 @@ fn profile_error_um(dataset: &Dataset, height_mm: fn(f64, f64) -> f64) -> Result
     let [x, y, h] = ["x_mm", "y_mm", "h_mm"].map(|name| table.numbers(name, &path));
     let (x, y, h) = (x?, y?, h?);
     let status = table.texts("status", &path)?;
-    let errors = (0..status.len())
-        .filter(|&k| status[k] == "ok")
-        .map(|k| 1e3 * (h[k] - height_mm(x[k], y[k])));
+    let errors =
+        (0..status.len()).filter(|&k| status[k] == "ok").map(|k| 1e3 * (h[k] - height_mm(x[k], y[k])));
     Ok(crate::measure::spread(errors))
 }
 

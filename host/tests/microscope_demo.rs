@@ -67,8 +67,12 @@ fn a_move_under_the_microscope_comes_back() {
     let (_, moved_um) = MOVES_UM[4];
     for (i, name) in ["u_mm", "v_mm", "w_mm"].into_iter().enumerate() {
         let values = table.numbers(name, &path).expect("numbers");
-        let squares: f64 =
-            values.iter().zip(&status).filter(|(_, s)| *s == "ok").map(|(v, _)| (1e3 * v - moved_um[i]).powi(2)).sum();
+        let squares: f64 = values
+            .iter()
+            .zip(&status)
+            .filter(|(_, s)| *s == "ok")
+            .map(|(v, _)| (1e3 * v - moved_um[i]).powi(2))
+            .sum();
         let rms = (squares / ok as f64).sqrt();
         assert!((rms - summary["rms_um"][i].as_f64().expect("a number")).abs() < 1e-9, "{name}");
         // The literature's set-up: 0.038, 0.022 and 0.232 µm for a translation of 10 µm.
@@ -91,11 +95,15 @@ fn a_move_under_the_microscope_comes_back() {
     ] {
         eprintln!("{name}: {found:.6e} ± {sigma:.1e}, geometry {truth:.6e}");
         // five standard deviations, and a thousandth for what interpolation does to each of them
-        assert!((found - truth).abs() < 5.0 * sigma + 1e-3 * truth.abs(), "{name}: {found} ± {sigma}, not {truth}");
+        assert!(
+            (found - truth).abs() < 5.0 * sigma + 1e-3 * truth.abs(),
+            "{name}: {found} ± {sigma}, not {truth}"
+        );
     }
 
     // `daic calibrate microscope` takes what is left as it is
-    let again = daic(&calibration, &["calibrate", "microscope", "moves.toml", "--out", "again.toml", "--json"]);
+    let again =
+        daic(&calibration, &["calibrate", "microscope", "moves.toml", "--out", "again.toml", "--json"]);
     assert_eq!(again.code, Some(0), "{}", again.err);
     let again = MicroscopeFile::load(&calibration.join("again.toml")).expect("reads back");
     assert_eq!(again.microscope, file.microscope);
@@ -112,15 +120,30 @@ fn a_move_under_the_microscope_comes_back() {
     };
     let (reference, z) = (file_of("reference"), file_of("cal_z_plus"));
     let arguments = [
-        "track", &reference, &z, "--roi", "114,97,485,526", "--subset", "41", "--step", "8", "--shape", "affine",
-        "--out", "fields", "--json", "--quiet",
+        "track",
+        &reference,
+        &z,
+        "--roi",
+        "114,97,485,526",
+        "--subset",
+        "41",
+        "--step",
+        "8",
+        "--shape",
+        "affine",
+        "--out",
+        "fields",
+        "--json",
+        "--quiet",
     ];
     let tracked = daic(folder, &arguments);
     assert_eq!(tracked.code, Some(0), "{}\n{}", tracked.out, tracked.err);
     let field = tracked.json()["frames"][0]["field"].as_str().expect("a path").to_owned();
     let path = folder.join(&field);
-    let (alone, stored) =
-        (Table::read_csv(&path).expect("field"), Table::read_csv(&calibration.join("cal_z_plus.csv")).expect("field"));
+    let (alone, stored) = (
+        Table::read_csv(&path).expect("field"),
+        Table::read_csv(&calibration.join("cal_z_plus.csv")).expect("field"),
+    );
     for name in ["x_minus_px", "x_plus_px", "u_minus_px", "v_plus_px", "sigma_u_plus_px"] {
         let both = [&alone, &stored].map(|t| t.numbers(name, &path).expect("numbers"));
         assert!(both[0].iter().zip(&both[1]).all(|(a, b)| a.to_bits() == b.to_bits()), "{name}");

@@ -22,8 +22,7 @@ fn config() -> SimConfig {
     config.scene.specimen.surface = SurfaceConfig::Plane { height_mm: 0.2, slope_x: 0.15, slope_y: -0.1 };
     config.scene.specimen.half_width_mm = 7.5;
     config.scene.specimen.half_height_mm = 7.5;
-    config.camera.bayer =
-        Some(BayerConfig { pattern: BayerPattern::Grbg, response: [1.0, 0.3, 0.05] });
+    config.camera.bayer = Some(BayerConfig { pattern: BayerPattern::Grbg, response: [1.0, 0.3, 0.05] });
     config
 }
 
@@ -75,7 +74,10 @@ fn a_channel_measures_where_its_pixels_are() {
         let mut settings = Settings { lattice: Lattice::bayer(origin), step: 8, ..Settings::default() };
         (settings.dic.subset, settings.dic.shape) = (41, daic_correlate::Shape::Affine);
         let reference = Reference::new(&before, &model, &settings, &Silent).expect("two views");
-        assert_eq!((reference.grid.step, reference.grid.x0 % 2, reference.grid.y0 % 2), (16, origin[0] as usize, 0));
+        assert_eq!(
+            (reference.grid.step, reference.grid.x0 % 2, reference.grid.y0 % 2),
+            (16, origin[0] as usize, 0)
+        );
         let tracks = reference.track(&after, &Silent).expect("tracked");
         let field = measure::displacement(
             &reference.grid,

@@ -152,14 +152,7 @@ impl Scene {
 
     /// The line of a pixel in the coordinates of a specimen shifted by `shift`.
     #[inline]
-    fn line(
-        &self,
-        view: View,
-        x_px: f64,
-        y_px: f64,
-        wavelength_mm: f64,
-        shift: [f64; 3],
-    ) -> Option<Line> {
+    fn line(&self, view: View, x_px: f64, y_px: f64, wavelength_mm: f64, shift: [f64; 3]) -> Option<Line> {
         let line = self.instrument.line(view, x_px, y_px, wavelength_mm)?;
         Some(Line {
             origin: [line.origin[0] - shift[0], line.origin[1] - shift[1], line.origin[2] - shift[2]],
@@ -174,9 +167,8 @@ fn smear_mm(instrument: &Instrument, [x, y]: [f64; 2], wavelength_mm: f64, width
         let line = instrument.line(view, x, y, wavelength)?;
         Some((-line.origin[2] / line.direction[2]).mul_add(line.direction[0], line.origin[0]))
     };
-    let smear = |view| {
-        Some(at(view, wavelength_mm + 0.5 * width_mm)? - at(view, wavelength_mm - 0.5 * width_mm)?)
-    };
+    let smear =
+        |view| Some(at(view, wavelength_mm + 0.5 * width_mm)? - at(view, wavelength_mm - 0.5 * width_mm)?);
     [View::Minus, View::Plus].into_iter().filter_map(smear).fold(0.0, |most: f64, s| most.max(s.abs()))
 }
 

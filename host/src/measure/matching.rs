@@ -125,12 +125,7 @@ fn lattice_image(frame: &GreyImage, lattice: Lattice) -> Result<Image, Error> {
 /// A rectangle of the lattice in pixels of the sensor.
 fn on_sensor(r: Rectangle, lattice: Lattice) -> Rectangle {
     let (pitch, [x, y]) = (lattice.pitch as usize, lattice.origin.map(|o| o as usize));
-    Rectangle {
-        x: pitch * r.x + x,
-        y: pitch * r.y + y,
-        width: pitch * r.width,
-        height: pitch * r.height,
-    }
+    Rectangle { x: pitch * r.x + x, y: pitch * r.y + y, width: pitch * r.width, height: pitch * r.height }
 }
 
 /// The pixels of the lattice in a rectangle of the sensor.

@@ -1,6 +1,8 @@
 //! Pixel pairs to points and displacements under the microscope.
 
-use crate::measure::{Displacement, DisplacementPoint, Grid, Match, PointStatus, Profile, ProfilePoint, Tracks};
+use crate::measure::{
+    Displacement, DisplacementPoint, Grid, Match, PointStatus, Profile, ProfilePoint, Tracks,
+};
 use daic_optics::microscope::Microscope;
 use daic_optics::{Decoded, PairModel as _, PixelPair, pixel_covariance};
 

@@ -24,7 +24,7 @@ pub use file::{Fit, FittedMotion, MicroscopeFile, MicroscopeSection};
 pub use known::{CalibratedModel, KnownMove, MoveSettings, from_moves};
 pub use moves::{Component, Correlation, MotionEntry, Moves};
 pub use report::page;
-pub use track::{Tracked, TrackOptions, track};
+pub use track::{TrackOptions, Tracked, track};
 
 /// What is wrong with a file of moves, of fields or of a microscope.
 #[derive(Debug, thiserror::Error)]

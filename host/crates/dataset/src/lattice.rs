@@ -34,7 +34,9 @@ impl Lattice {
         let along = |from: u32, to: u32| to.saturating_sub(from).div_ceil(pitch);
         let (width, height) = (along(x0, image.width), along(y0, image.height));
         let mut data = Vec::with_capacity(width as usize * height as usize);
-        for row in image.data.chunks_exact(image.width.max(1) as usize).skip(y0 as usize).step_by(pitch as usize) {
+        for row in
+            image.data.chunks_exact(image.width.max(1) as usize).skip(y0 as usize).step_by(pitch as usize)
+        {
             data.extend(row.iter().skip(x0 as usize).step_by(pitch as usize));
         }
         GreyImage { width, height, data, ..*image }

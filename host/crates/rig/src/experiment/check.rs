@@ -1,7 +1,9 @@
 //! Rules between values: each finding names field, value and allowed range.
 
 use super::problem::Finding;
-use super::{Axis, Experiment, FrameStep, Grating, Microscope, Optics, OpticsFile, Processing, Rig, Step, Strobe};
+use super::{
+    Axis, Experiment, FrameStep, Grating, Microscope, Optics, OpticsFile, Processing, Rig, Step, Strobe,
+};
 use crate::units::{Length, Time};
 use daic_protocol::{channels, limits::MAX_LOOP_DEPTH};
 use std::fmt::Display;
@@ -115,10 +117,8 @@ fn rig(rig: &Rig, f: &mut Findings) {
     f.time("rig.camera.readout", camera.readout, false);
     f.time("rig.camera.row_time", camera.row_time, false);
     f.time("rig.camera.row_time, times the rows", camera.rolling(), false);
-    let busy = camera.exposure_delay.ns()
-        + camera.exposure.ns()
-        + camera.rolling().ns()
-        + camera.readout.ns();
+    let busy =
+        camera.exposure_delay.ns() + camera.exposure.ns() + camera.rolling().ns() + camera.readout.ns();
     f.require(
         camera.trigger_width.ns() < busy,
         "rig.camera.trigger_width",
@@ -201,12 +201,7 @@ fn strobe(rig: &Rig, strobe: &Strobe, field: &str, f: &mut Findings) {
 fn microscope(m: &Microscope, f: &mut Findings) {
     f.positive("microscope.pixel", m.pixel);
     let search = m.search.px();
-    f.require(
-        (1.0..=10_000.0).contains(&search),
-        "microscope.search",
-        m.search,
-        "1 px to 10000 px",
-    );
+    f.require((1.0..=10_000.0).contains(&search), "microscope.search", m.search, "1 px to 10000 px");
 }
 
 fn optics(o: &Optics, f: &mut Findings) {

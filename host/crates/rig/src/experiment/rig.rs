@@ -137,7 +137,9 @@ impl std::str::FromStr for Bayer {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let wrong = || {
-            format!("found `{text}`, wanted a pattern (rggb, grbg, gbrg, bggr) and a channel (r, gr, gb, b): rggb:r")
+            format!(
+                "found `{text}`, wanted a pattern (rggb, grbg, gbrg, bggr) and a channel (r, gr, gb, b): rggb:r"
+            )
         };
         let (pattern, channel) = text.split_once(':').ok_or_else(wrong)?;
         let pattern = match pattern {
