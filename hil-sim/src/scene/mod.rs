@@ -18,8 +18,8 @@ use trace::{ObjectLine, Tracer, View};
 /// Camera and gratings of either set-up.
 #[derive(Debug)]
 enum Instrument {
-    Macro(Tracer),
-    Microscope(MicroscopeTracer),
+    Macro(Box<Tracer>),
+    Microscope(Box<MicroscopeTracer>),
 }
 
 impl Instrument {
@@ -81,8 +81,10 @@ impl Scene {
         let (width, height) = (config.camera.width, config.camera.height);
         let SceneConfig { optics, microscope, spectrum, specimen, texture, samples, .. } = &config.scene;
         let (instrument, wavelength) = match microscope {
-            None => (Instrument::Macro(Tracer::new(optics, width, height)), optics.wavelength_mm),
-            Some(m) => (Instrument::Microscope(MicroscopeTracer::new(m, width, height)), m.wavelength_mm),
+            None => (Instrument::Macro(Box::new(Tracer::new(optics, width, height))), optics.wavelength_mm),
+            Some(m) => {
+                (Instrument::Microscope(Box::new(MicroscopeTracer::new(m, width, height))), m.wavelength_mm)
+            }
         };
         let surface = Surface::new(specimen)?;
         let cone = microscope.as_ref().filter(|m| m.numerical_aperture > 0.0).map(|m| {

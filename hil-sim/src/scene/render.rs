@@ -53,10 +53,10 @@ impl Scene {
         let Some(cone) = &self.cone else { return at(chief) };
         let focus = cone.focus_mm - shift[2];
         // So near the sharp plane that the cone is narrower than a twentieth of a pixel, its chief ray does.
-        if let Some([x, y, h]) = self.surface.first_hit(chief) {
-            if (h - focus).abs() * cone.widest < 0.05 * pixel_mm {
-                return self.texture.reflectance(x, y);
-            }
+        if let Some([x, y, h]) = self.surface.first_hit(chief)
+            && (h - focus).abs() * cone.widest < 0.05 * pixel_mm
+        {
+            return self.texture.reflectance(x, y);
         }
         let [x, y] = chief.at_height(focus);
         let fall = -chief.direction[2];

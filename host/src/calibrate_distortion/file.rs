@@ -71,7 +71,7 @@ impl DistortionFile {
         if !file.sigma_px.iter().flatten().all(|s| s.is_finite() && *s >= 0.0) {
             return Err(wrong("sigma_px holds a value that is no standard deviation".to_owned()));
         }
-        if !(file.camera.focal_px > 0.0) {
+        if file.camera.focal_px.is_nan() || file.camera.focal_px <= 0.0 {
             return Err(wrong(format!("camera.focal_px is {}, it must be above 0", file.camera.focal_px)));
         }
         Ok(file)

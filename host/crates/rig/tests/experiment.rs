@@ -268,7 +268,7 @@ fn the_golden_optics_fit_what_the_golden_frames_state() {
 fn optics_files_read_back_to_the_same_bits_and_refuse_other_formats() {
     let path = Path::new("optics.toml");
     let whole = OpticsFile::parse(template(), path).expect("an experiment will do");
-    assert_eq!(Some(whole.optics), parse(template()).expect("template").optics);
+    assert_eq!(Some(whole.optics.clone()), parse(template()).expect("template").optics);
     let mut file = OpticsFile {
         format: Some(OpticsFile::FORMAT.to_owned()),
         provenance: Some("test".to_owned()),

@@ -8,6 +8,9 @@ use crate::model::OpticalModel;
 use crate::real::{Dual, solve2};
 use crate::setup::View;
 
+/// Two coordinates, or one value of each grating direction.
+type Pair = [f64; 2];
+
 /// Where a point of the plane is seen: pixels of the ideal camera, or millimetres on the reference
 /// plane and the exact rays through the grating.
 pub(super) struct Prediction {
@@ -122,14 +125,14 @@ impl Carrier {
         brown: &Brown,
         pose: TargetPose,
     ) -> Result<Self, DistortionError> {
-        let seen: Vec<([f64; 2], [f64; 2])> =
+        let seen: Vec<(Pair, Pair)> =
             samples.iter().filter_map(|s| Some((prediction.plane(s.pixel, brown)?, s.turns))).collect();
         let undetermined = DistortionError::TooFew { found: seen.len(), needed: super::LEAST_SAMPLES };
         if seen.len() < super::LEAST_SAMPLES {
             return Err(undetermined);
         }
         let n = seen.len() as f64;
-        let mean = |f: &dyn Fn(&([f64; 2], [f64; 2])) -> f64| seen.iter().map(f).sum::<f64>() / n;
+        let mean = |f: &dyn Fn(&(Pair, Pair)) -> f64| seen.iter().map(f).sum::<f64>() / n;
         let centre = [0, 1].map(|i| mean(&|s| s.0[i]));
         let turns_centre = [0, 1].map(|i| mean(&|s| s.1[i]));
         let scale = mean(&|s| (s.0[0] - centre[0]).hypot(s.0[1] - centre[1]));
@@ -158,7 +161,7 @@ impl Carrier {
     }
 
     /// Coordinates on the plane from both phases; A⁻¹ for scaled coordinates.
-    fn plane(&self, turns: [f64; 2]) -> Option<([f64; 2], [f64; 2], [[f64; 2]; 2])> {
+    fn plane(&self, turns: [f64; 2]) -> Option<(Pair, Pair, [Pair; 2])> {
         let t = [0, 1].map(|k| (turns[k] - self.turns_centre[k]) / self.turns_scale[k]);
         let den = self.denominators();
         let a = [0, 1]
