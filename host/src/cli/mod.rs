@@ -10,6 +10,7 @@ mod microscope;
 mod output;
 mod plan;
 mod strain;
+mod surface;
 
 use arguments::{Cli, Command};
 use clap::Parser as _;
@@ -59,8 +60,9 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Probe(arguments) => strain::probe(arguments),
         Command::NoiseFloor(arguments) => strain::noise_floor(arguments, output),
         Command::Phase(arguments) => commands::phase(arguments, output),
-        Command::Profile(arguments) => commands::profile(arguments, output),
-        Command::Displacement(arguments) => commands::displacement(arguments, output),
+        Command::Decode(arguments) => surface::decode(arguments),
+        Command::Profile(arguments) => surface::profile(arguments, output),
+        Command::Displacement(arguments) => surface::displacement(arguments, output),
         Command::Calibrate(arguments) => calibrate::calibrate(arguments, output),
         Command::Plan(arguments) => plan::plan(arguments),
         Command::Align(arguments) => align::align(arguments),

@@ -12,7 +12,9 @@ mod processing;
 mod rig;
 mod sequence;
 
-pub use optics::{Brown, Covariance, Grating, Optics, OpticsFile, Reference, Side, Substrate};
+pub use optics::{
+    Brown, Covariance, Grating, MapFile, Maps, Optics, OpticsFile, Reference, Side, Substrate, Volume,
+};
 pub use problem::{ConfigError, Problem, ProblemKind};
 pub use processing::{Criterion, Decoder, Interpolation, Processing, Shape, Solver};
 pub use rig::{Axes, Axis, CameraSection, CameraSource, Rig, Strobe};
@@ -88,6 +90,8 @@ impl OpticsFile {
                 date: None,
                 optics: experiment.optics,
                 covariance: None,
+                maps: None,
+                volume: None,
             });
         }
         let file: Self = problem::from_toml(text, path)?;
