@@ -371,6 +371,10 @@ pub fn write_optics(
     file.optics.brown = (brown != experiment::Brown::default()).then_some(brown);
     file.optics.pinhole_to_grating = Length::new(found.found.pinhole_to_grating_mm.value);
     file.optics.grating_to_reference = Length::new(found.found.grating_to_board_mm.value);
+    // what an earlier calibration said of itself does not hold for these values
+    (file.covariance, file.volume) = (None, None);
+    let folder = |path: &Path| path.parent().unwrap_or(Path::new("")).to_owned();
+    file.maps = crate::optics_file::moved_maps(file.maps.as_ref(), &folder(from), &folder(to))?;
     file.provenance = Some(format!(
         "camera of {} ({}), distances of {} ({}, {})",
         camera.date,

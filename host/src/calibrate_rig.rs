@@ -7,12 +7,14 @@
 //! has `pose`, `x_mm`, `y_mm`, `h_mm` against the reference pose (empty where unknown).
 
 use crate::error::Error;
+use crate::optics_file::{self, CalibratedOptics};
 use crate::optics_section;
 use daic_dataset::{Table, atomic};
 use daic_optics::bundle::{Known, PlatePose, Seen, Sighting};
-use daic_optics::{DistortionMaps, RigCalibration, RigData, RigSettings, View, calibrate_rig};
+use daic_optics::{RigCalibration, RigData, RigSettings, View, calibrate_rig};
 use daic_report::{Cell, Chart, Figure, Report, Section, Series, SeriesStyle, TableBlock};
-use daic_rig::experiment::{Covariance, OpticsFile};
+use daic_rig::experiment::{Covariance, OpticsFile, Volume};
+use daic_rig::units::Length;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -86,8 +88,8 @@ pub struct Summary {
 /// # Errors
 /// The file or the value that is to blame, or [`Error::CalibrateRig`].
 pub fn run(options: &Options) -> Result<Summary, Error> {
-    let file = OpticsFile::load(&options.optics)?;
-    let start = optics_section::from_section(&file.optics)?;
+    let from = CalibratedOptics::load(&options.optics)?;
+    let (file, start) = (&from.file, from.optics);
     let (mut data, poses) = read_points(&options.points, options.sigma_px)?;
     if let Some(moves) = &options.moves {
         read_moves(moves, options.move_sigma_mm, &poses, &mut data)?;
@@ -105,14 +107,17 @@ pub fn run(options: &Options) -> Result<Summary, Error> {
             }
         })?;
     }
-    let found = calibrate_rig(&start, &DistortionMaps::NONE, &data, &settings)?;
+    let found = calibrate_rig(&start, &from.maps(), &data, &settings)?;
     let page = page(&found, &poses)?;
     let path = options.out.join("optics.toml");
-    let text = to_file(&file, &found, poses.len())
-        .to_toml()
-        .map_err(|source| Error::Unwritable { path: path.clone(), reason: source.to_string() })?;
     std::fs::create_dir_all(&options.out)
         .map_err(|source| Error::Folder { path: options.out.clone(), source })?;
+    let mut made = to_file(file, &found, poses.len());
+    let folder = options.optics.parent().unwrap_or(Path::new(""));
+    made.maps = optics_file::moved_maps(file.maps.as_ref(), folder, &options.out)?;
+    let text = made
+        .to_toml()
+        .map_err(|source| Error::Unwritable { path: path.clone(), reason: source.to_string() })?;
     atomic::write_bytes(&path, text.as_bytes())?;
     atomic::write_bytes(&options.out.join("report.html"), page.as_bytes())?;
     Ok(summary(&found, &poses, path))
@@ -191,6 +196,7 @@ fn whole(path: &Path, column: &'static str, values: &[f64]) -> Result<Vec<i64>, 
 fn to_file(start: &OpticsFile, found: &RigCalibration, poses: usize) -> OpticsFile {
     let names = found.covariance.parameters().iter().map(|p| p.name().to_owned());
     let matrix = found.covariance.matrix();
+    let side = |i: usize| [found.volume.from_mm[i], found.volume.to_mm[i]].map(Length::new);
     OpticsFile {
         format: Some(OpticsFile::FORMAT.to_owned()),
         provenance: Some(format!(
@@ -205,6 +211,8 @@ fn to_file(start: &OpticsFile, found: &RigCalibration, poses: usize) -> OpticsFi
             parameters: names.collect(),
             matrix: matrix.row_iter().map(|row| row.iter().copied().collect()).collect(),
         }),
+        maps: None,
+        volume: Some(Volume { x: side(0), y: side(1), h: side(2) }),
     }
 }
 

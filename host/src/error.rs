@@ -116,6 +116,51 @@ pub enum Error {
         /// What is wrong, with the parameter's name.
         reason: String,
     },
+    /// A distortion map that the optics file names and that is not the one meant.
+    #[error("{}: maps.{name}: {reason}", path.display())]
+    OpticsMap {
+        /// The optics file.
+        path: PathBuf,
+        /// `sensor`, `minus` or `plus`.
+        name: &'static str,
+        /// What is wrong, and the way out.
+        reason: String,
+    },
+    /// A file of a distortion map that cannot be used.
+    #[error("{} is no usable distortion map: {reason}; write it anew with `daic calibrate distortion`", path.display())]
+    DistortionFile {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, with the field's name.
+        reason: String,
+    },
+    /// The −1 and the +1 view taken for each other.
+    #[error(
+        "the −1 and +1 views are mistaken for each other: the lines of sight of {points} pairs meet on the camera's side of the grating or not at all. The −1 view is the one on the left of the sensor; exchange the pixels of the two views, or turn the images"
+    )]
+    SwappedOrders {
+        /// Pairs of which this is so.
+        points: usize,
+    },
+    /// A step of the grid of object coordinates that gives none, or too large a one.
+    #[error(
+        "no grid of object coordinates: {nodes} nodes at a step of {step_mm} mm; give --object-step between the distance of the points and a hundredth of it"
+    )]
+    ObjectGrid {
+        /// Distance of nodes.
+        step_mm: f64,
+        /// How many there would be.
+        nodes: f64,
+    },
+    /// A map that every result has.
+    #[error("the results hold no map `{name}`")]
+    NoMap {
+        /// Its name.
+        name: &'static str,
+    },
+    /// Strain on the surface.
+    #[error("the strain on the surface cannot be computed: {0}")]
+    SurfaceStrain(#[from] daic_optics::surface::SurfaceError),
     /// The rig could not be calibrated.
     #[error("no calibration of the rig: {0}")]
     CalibrateRig(#[from] daic_optics::RigError),
@@ -141,14 +186,6 @@ pub enum Error {
     /// Rays through the grating were asked for without what they need.
     #[error("--ideal ray traces rays through the grating: it needs --optics FILE and --view minus or plus")]
     IdealRay,
-    /// A file of a distortion map that cannot be used.
-    #[error("{} is no usable distortion map: {reason}; write it anew with `daic calibrate distortion`", path.display())]
-    DistortionFile {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong, with the field's name.
-        reason: String,
-    },
     /// A row of a table of tracked points or moves that cannot be used.
     #[error("{}, row {row}: {column} is {value}, it must be {allowed}", path.display())]
     TrackedPoint {

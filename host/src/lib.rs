@@ -14,6 +14,8 @@
 //! * [`calibrate_distortion`]: images of a line target become a distortion map.
 //! * [`calibrate_rig`]: points tracked on a plate become an optics file.
 //! * [`calibrate_camera`]: a camera from images of a board; [`align`]: lining up a rig.
+//! * [`optics_file`]: an optics file with covariance, distortion maps ([`distortion_file`]) and volume, ready to
+//!   decode; [`pairs`] decodes pixel pairs from elsewhere.
 //! * [`sequence`]: the same of a series of images.
 //! * [`microscope`]: calibration of the microscope from known motions.
 
@@ -25,6 +27,7 @@ pub mod calibrate_rig;
 pub mod camera_file;
 #[cfg(feature = "sim")]
 pub mod demo;
+pub mod distortion_file;
 pub mod doctor;
 pub mod error;
 pub mod expand;
@@ -35,8 +38,10 @@ pub mod images;
 pub mod measure;
 pub mod microscope;
 pub mod noise_floor;
+pub mod optics_file;
 pub mod optics_section;
 pub mod pair;
+pub mod pairs;
 pub mod phase;
 pub mod probe;
 pub mod process;

@@ -2,7 +2,7 @@
 #![cfg(feature = "sim")]
 
 use daic::Silent;
-use daic::measure::{self, Reference, Settings};
+use daic::measure::{self, Instrument, Reference, Settings, status_counts};
 use daic_dataset::{GreyImage, Lattice};
 use daic_hil_sim::SimConfig;
 use daic_hil_sim::config::{BayerConfig, BayerPattern, SurfaceConfig};
@@ -67,6 +67,7 @@ fn a_channel_measures_where_its_pixels_are() {
     let config = config();
     let scene = Scene::new(&config).expect("valid");
     let model = model(&config);
+    let instrument = Instrument::new(model.clone(), Decoder::Ray);
     let moved_mm = [0.08, -0.05, 0.3];
     let (before, after) = (frame(&config, &scene, [0.0; 3], 0), frame(&config, &scene, moved_mm, 1));
     // Pattern GRBG: red at (1, 0), green of the red rows at (0, 0).
@@ -83,10 +84,10 @@ fn a_channel_measures_where_its_pixels_are() {
             &reference.grid,
             &reference.matches,
             &tracks,
-            &model,
-            Decoder::Ray,
+            &instrument,
             settings.height_mm,
         );
+        eprintln!("{name}: {}", status_counts(field.points.iter().map(|p| p.status)));
         let ok: Vec<_> = field.points.iter().filter(|p| p.status.is_ok()).collect();
         assert!(ok.len() > 300, "{name}: {}", ok.len());
         let mut squares = [[0.0; 3]; 2];

@@ -16,6 +16,7 @@ cargo xtask COMMAND
   lint       formatting, clippy, documentation without warnings, cargo-deny where installed
   ci         test, then lint
   figures    draws the pictures of README and docs anew with the program itself
+  coverage   2 000 simulated calibrations: what the stated uncertainties cover (minutes)
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders
              guard [--update]: instruction counts against the baseline (or: makes a new one)
@@ -33,6 +34,7 @@ fn main() -> ExitCode {
             report
         }
         ["figures"] => steps::figures(),
+        ["coverage"] => steps::coverage(),
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),
         ["bench", "optics"] => steps::bench_optics(),

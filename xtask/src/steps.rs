@@ -188,6 +188,18 @@ pub fn figures() -> Report {
     report
 }
 
+/// The Monte-Carlo of the uncertainties that is too long for every day.
+pub fn coverage() -> Report {
+    let mut report = Report::default();
+    report.step("coverage of the stated uncertainties, 2 000 calibrations", || {
+        let arguments = ["test", "--release", "--locked", "--package", "daic", "--test", "coverage", "--"];
+        let mut command = cargo(&arguments);
+        command.args(["--ignored", "--nocapture"]);
+        outcome_of(command)
+    });
+    report
+}
+
 /// Speed of the optics.
 pub fn bench_optics() -> Report {
     let mut report = Report::default();

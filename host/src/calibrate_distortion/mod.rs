@@ -4,10 +4,9 @@
 //! `sigma_x`, `sigma_y`, `brown_x`, `brown_y`, `measured` at the nodes), `distortion.svg`-figures and
 //! `report.html`.
 
-mod file;
 mod page;
 
-pub use file::{DistortionFile, IdealImage};
+pub use crate::distortion_file::{DistortionFile, IdealImage};
 
 use crate::error::Error;
 use crate::measure::{Rectangle, image_of};

@@ -38,6 +38,8 @@ pub enum Command {
     Process(ProcessArgs),
     /// Correlate two images or a series (2D-DIC); takes up a series that was interrupted
     Correlate(CorrelateArgs),
+    /// Points from pixel pairs that were matched elsewhere
+    Decode(DecodeArgs),
     /// Strain from the points of `daic correlate`
     Strain(StrainArgs),
     /// Values at points and along lines, virtual extensometers, from the points of `daic correlate`
@@ -368,6 +370,24 @@ pub enum DecoderArg {
 }
 
 #[derive(Debug, Args)]
+pub struct DecodeArgs {
+    /// Optics file (examples/golden-macro.toml)
+    #[arg(long, value_name = "FILE")]
+    pub optics: PathBuf,
+    /// Table (CSV) of pixel pairs: minus_x, minus_y, plus_x, plus_y and perhaps sigma_px
+    pub pairs: PathBuf,
+    /// How pixel pairs become points
+    #[arg(long, default_value = "ray")]
+    pub decoder: DecoderArg,
+    /// Standard deviation of a pixel coordinate where the table states none
+    #[arg(long, value_name = "PX", default_value_t = 0.01, value_parser = positive)]
+    pub sigma: f64,
+    /// Points to this file (.csv or .npz)
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
+}
+
+#[derive(Debug, Args)]
 pub struct ProfileArgs {
     /// Optics file (examples/golden-macro.toml)
     #[arg(long, value_name = "FILE")]
@@ -382,6 +402,9 @@ pub struct ProfileArgs {
     pub bayer: Option<daic_rig::experiment::Bayer>,
     #[command(flatten)]
     pub dic: DicArgs,
+    /// Distance of the nodes in object coordinates (default: as far as the points are)
+    #[arg(long, value_name = "MM", value_parser = positive)]
+    pub object_step: Option<f64>,
     /// Folder for points, maps and the report
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
@@ -404,6 +427,15 @@ pub struct DisplacementArgs {
     pub bayer: Option<daic_rig::experiment::Bayer>,
     #[command(flatten)]
     pub dic: DicArgs,
+    /// Distance of the nodes in object coordinates (default: as far as the points are)
+    #[arg(long, value_name = "MM", value_parser = positive)]
+    pub object_step: Option<f64>,
+    /// Strain on the measured surface as well: Green–Lagrange in the local tangent plane
+    #[arg(long)]
+    pub surface_strain: bool,
+    /// Points along the side of the strain window, odd
+    #[arg(long, value_name = "POINTS", default_value_t = 11, requires = "surface_strain")]
+    pub strain_window: u16,
     /// Folder for points, maps and the report
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,

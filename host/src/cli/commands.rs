@@ -1,24 +1,21 @@
 //! What each command does: arguments to facade calls, results to an answer.
 
 use super::arguments::{
-    AreaArgs, CorrelateArgs, CriterionArg, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, GratingsArg,
-    GuessArg, InitArgs, InterpolationArg, PhaseArgs, ProcessArgs, ProfileArgs, Roi, RunArgs, ShapeArg,
-    SolverArg, TrackArgs, UpdateArg,
+    AreaArgs, CorrelateArgs, CriterionArg, DicArgs, DoctorArgs, GratingsArg, GuessArg, InitArgs,
+    InterpolationArg, PhaseArgs, ProcessArgs, Roi, RunArgs, ShapeArg, SolverArg, UpdateArg,
 };
 #[cfg(feature = "sim")]
 use super::arguments::{DemoArgs, SceneArg, SimulateArgs};
 use super::output::{Answer, Output};
 use daic::area::{self, Area};
-use daic::measure::{self, Rectangle, Reference};
+use daic::measure::{self, Rectangle};
 use daic::sequence::{self, Description};
 use daic::{
-    Error, Progress as _, doctor as checks, frames, images, optics_section, pair, phase as gratings,
-    process as processing, reports,
+    Error, Progress as _, doctor as checks, frames, images, pair, phase as gratings, process as processing,
 };
 use daic_correlate::{Guess, StartReport, StartWarning};
 use daic_dataset::{Existing, GreyImage, atomic};
-use daic_optics::{Decoder, OpticalModel};
-use daic_rig::experiment::{self, Experiment, OpticsFile};
+use daic_rig::experiment::{self, Experiment};
 use serde_json::json;
 use std::fmt::Write as _;
 use std::path::Path;
@@ -431,109 +428,8 @@ pub fn shape(shape: ShapeArg) -> daic_correlate::Shape {
     }
 }
 
-fn decoder(decoder: DecoderArg) -> Decoder {
-    match decoder {
-        DecoderArg::Ray => Decoder::Ray,
-        DecoderArg::Closed => Decoder::Closed,
-        DecoderArg::Linear => Decoder::Linear,
-    }
-}
-
-fn measure_settings(arguments: &DicArgs, bayer: Option<experiment::Bayer>) -> measure::Settings {
-    let lattice = daic::settings::lattice(bayer);
-    let mut settings = measure::Settings { lattice, ..measure::Settings::default() };
-    apply(arguments, &mut settings.dic, &mut settings.step);
-    settings
-}
-
-fn model(path: &Path) -> Result<OpticalModel, Error> {
-    Ok(OpticalModel::new(&optics_section::from_section(&OpticsFile::load(path)?.optics)?)?)
-}
-
-fn make_folder(path: &Path) -> Result<(), Error> {
+pub fn make_folder(path: &Path) -> Result<(), Error> {
     std::fs::create_dir_all(path).map_err(|source| Error::Folder { path: path.to_owned(), source })
-}
-
-pub fn profile(arguments: &ProfileArgs, output: &Output) -> Result<Answer, Error> {
-    let model = model(&arguments.optics)?;
-    let frame = images::read(&arguments.frame)?;
-    let settings = measure_settings(&arguments.dic, arguments.bayer);
-    let reference = Reference::new(&frame, &model, &settings, output)?;
-    let decoder = decoder(arguments.decoder);
-    let profile = measure::profile(&reference.grid, &reference.matches, &model, decoder).with_points()?;
-    let linear = measure::profile(&reference.grid, &reference.matches, &model, Decoder::Linear);
-    // whatever can fail does so before the first file
-    let page = reports::profile_page(&frame, &reference, &profile, &linear, decoder, &settings)?;
-    make_folder(&arguments.out)?;
-    measure::write_profile(&arguments.out, &profile)?;
-    atomic::write_bytes(&arguments.out.join("report.html"), page.as_bytes())?;
-    let summary = processing::profile_summary(&profile);
-    let text = format!(
-        "{} of {} points, mean height {:.4} mm, σ of a height {:.2} µm, mean gap {:.2} µm\nreport: {}",
-        summary.ok,
-        summary.points,
-        summary.mean_h_mm,
-        summary.sigma_h_um,
-        summary.mean_gap_um,
-        arguments.out.join("report.html").display()
-    );
-    Ok(Answer::new(as_json(&summary)?, text))
-}
-
-pub fn displacement(arguments: &DisplacementArgs, output: &Output) -> Result<Answer, Error> {
-    let model = model(&arguments.optics)?;
-    let (frame, deformed) = images::read_pair(&arguments.reference, &arguments.deformed)?;
-    let settings = measure_settings(&arguments.dic, arguments.bayer);
-    let reference = Reference::new(&frame, &model, &settings, output)?;
-    let tracks = reference.track(&deformed, output)?;
-    let decoder = decoder(arguments.decoder);
-    let field = measure::displacement(
-        &reference.grid,
-        &reference.matches,
-        &tracks,
-        &model,
-        decoder,
-        settings.height_mm,
-    )
-    .with_points()?;
-    let page = reports::displacement_page(&frame, &reference, &field, decoder, &settings)?;
-    make_folder(&arguments.out)?;
-    measure::write_displacement(&arguments.out, &field)?;
-    atomic::write_bytes(&arguments.out.join("report.html"), page.as_bytes())?;
-    let summary = processing::field_summary(&field);
-    let [u, v, w] = summary.measured_um;
-    let [su, sv, sw] = summary.std_um;
-    let text = format!(
-        "{} of {} points: u {u:.3} µm (scatter {su:.3}), v {v:.3} µm ({sv:.3}), w {w:.3} µm ({sw:.3})\nreport: {}",
-        summary.ok,
-        summary.points,
-        arguments.out.join("report.html").display()
-    );
-    Ok(Answer::new(as_json(&summary)?, text))
-}
-
-pub fn track(arguments: &TrackArgs, output: &Output) -> Result<Answer, Error> {
-    let mut settings = measure_settings(&arguments.dic, arguments.bayer);
-    if let Some(roi) = arguments.roi {
-        settings.roi = Some(rectangle(roi, &images::read(&arguments.reference)?)?);
-    }
-    let options = daic::microscope::TrackOptions {
-        reference: arguments.reference.clone(),
-        frames: arguments.frames.clone(),
-        search_px: arguments.search,
-        settings,
-        out: arguments.out.clone(),
-    };
-    let found = daic::microscope::track(&options, output)?;
-    let mut text = String::new();
-    for t in &found {
-        let [a, b, c, d] = t.mean_px;
-        let (frame, ok, points, field) = (&t.frame, t.ok, t.points, &t.field);
-        writeln!(text, "{frame}: {ok} of {points} points, −1 view ({a:.3}, {b:.3}) px, +1 view ({c:.3}, {d:.3}) px (mean) -> {field}").ok();
-    }
-    text.push_str("next: name the fields in a file of moves for daic calibrate microscope");
-    let all = found.iter().all(|t| t.ok > 0);
-    Ok(Answer::new(json!({ "frames": as_json(&found)? }), text).checked(all))
 }
 
 pub fn init(arguments: &InitArgs) -> Result<Answer, Error> {

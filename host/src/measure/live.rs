@@ -1,7 +1,7 @@
 //! Frame after frame to height maps, in memory that is taken once.
 
 use super::matching::match_of;
-use super::{Grid, Match, Profile, Rectangle, Reference, Settings, profile};
+use super::{Grid, Instrument, Match, Profile, Rectangle, Reference, Settings, profile};
 use crate::error::Error;
 use crate::progress::Progress;
 use daic_correlate::{Guess, Image, Points, Reference as Subsets, Roi, ShapeParameters, Target, Workspace};
@@ -14,8 +14,7 @@ const MARGIN: usize = 64;
 /// Matches the two views of every frame and decodes the surface. The views are found in the first
 /// frame; only their surroundings are looked at afterwards, and each frame starts from the last.
 pub struct Live {
-    model: OpticalModel,
-    decoder: Decoder,
+    instrument: Instrument,
     settings: Settings,
     /// Size of the frames.
     frame: (usize, usize),
@@ -58,7 +57,8 @@ impl Live {
             return Err(Error::LiveMosaic);
         }
         let first = Reference::new(frame, model, settings, progress)?;
-        profile(&first.grid, &first.matches, model, decoder).with_points()?;
+        let instrument = Instrument::new(model.clone(), decoder);
+        profile(&first.grid, &first.matches, &instrument).with_points()?;
         let mut shifts: Vec<[f64; 2]> = first
             .matches
             .iter()
@@ -90,8 +90,7 @@ impl Live {
         let points = Points::grid(w, h, settings.dic.subset, settings.step, &roi)?;
         let empty = || Image::from_u8(1, 1, &[0]);
         Ok(Self {
-            model: model.clone(),
-            decoder,
+            instrument,
             settings: settings.clone(),
             frame: (width, height),
             minus,
@@ -155,6 +154,6 @@ impl Live {
             }
             self.matches.push(m);
         }
-        Ok(profile(&self.grid, &self.matches, &self.model, self.decoder))
+        Ok(profile(&self.grid, &self.matches, &self.instrument))
     }
 }

@@ -45,6 +45,29 @@ impl Default for Settings {
     }
 }
 
+impl Settings {
+    /// Overlapping subsets see the same pixels: how many points of a grid have one independent measurement
+    /// between them.
+    ///
+    /// A first-order subset averages over its whole area, so neighbours closer than its side share their noise:
+    /// (subset/step)² of them. The estimate of a second-order one rests on its middle: its kernel's noise is
+    /// 1 + 5/4 + 5/4 = 3.5 times that of the mean over the square (the constant beside x² and y²), and shared
+    /// by so many times fewer points.
+    pub fn points_per_measurement(&self) -> f64 {
+        let ratio = self.dic.subset as f64 / self.step as f64;
+        let narrower = match self.dic.shape {
+            daic_correlate::Shape::Quadratic => 3.5,
+            _ => 1.0,
+        };
+        (ratio * ratio / narrower).max(1.0)
+    }
+
+    /// Over how many points along either axis neighbours share their noise.
+    pub fn overlap(&self) -> f64 {
+        self.points_per_measurement().sqrt()
+    }
+}
+
 /// Beyond the v that the optics expect, this much is searched: gratings rotated by 10 mrad.
 const V_MARGIN_PX: f64 = 10.0;
 /// Beyond the u that the heights allow: distances that are 1 % wrong.

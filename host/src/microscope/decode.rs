@@ -1,85 +1,104 @@
 //! Pixel pairs to points and displacements under the microscope.
 
 use crate::measure::{
-    Displacement, DisplacementPoint, Grid, Match, PointStatus, Profile, ProfilePoint, Tracks,
+    Displacement, DisplacementPoint, GapField, Grid, Match, PointStatus, Profile, ProfilePoint, Tracks,
 };
 use daic_optics::microscope::Microscope;
-use daic_optics::{Decoded, PairModel as _, PixelPair, pixel_covariance};
+use daic_optics::{Decoded, PairModel as _, PixelPair, TraceError, pixel_covariance};
+use nalgebra::{Matrix3, SMatrix};
 
-fn surface_point(decoded: Option<&Decoded>, matched: &Match, status: PointStatus) -> ProfilePoint {
-    let pixel_px = matched.pair.minus_px;
-    match decoded {
-        Some(decoded) => {
-            let covariance = decoded.covariance_mm2(&pixel_covariance([0.0; 2], matched.sigma_px));
-            ProfilePoint {
-                pixel_px,
-                point_mm: decoded.point_mm.into(),
-                sigma_mm: [0, 1, 2].map(|i| covariance[(i, i)].sqrt()),
-                gap_mm: decoded.gap_mm,
-                status,
-            }
+/// A microscope and the covariance of its six parameters.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Instrument {
+    /// The model.
+    pub model: Microscope,
+    /// Covariance of [`daic_optics::microscope::Parameters::to_array`].
+    pub covariance: SMatrix<f64, 6, 6>,
+}
+
+impl Instrument {
+    fn common(&self, by: &SMatrix<f64, 3, 6>) -> Matrix3<f64> {
+        by * self.covariance * by.transpose()
+    }
+
+    fn decoded(&self, matched: &Match) -> Result<ProfilePoint, TraceError> {
+        let decoded: Decoded = self.model.decode_pair(matched.pair)?;
+        let pixels = pixel_covariance([0.0; 2], matched.sigma_px);
+        Ok(ProfilePoint {
+            pixel_px: matched.pair.minus_px,
+            plus_px: matched.pair.plus_px,
+            point_mm: decoded.point_mm.into(),
+            independent_mm2: decoded.covariance_mm2(&pixels),
+            common_mm2: self.common(&self.model.parameter_jacobian(matched.pair)?),
+            gap_mm: decoded.gap_mm,
+            sigma_gap_mm: decoded.gap_variance_mm2(&pixels).sqrt(),
+            // the gap is the departure of y₊ − y₋ from that of the datum: no parameter enters to first order
+            common_gap_mm: 0.0,
+            gap_by_v_mm_per_px: decoded.gap_jacobian[3],
+            status: PointStatus::Ok,
+        })
+    }
+
+    fn point(&self, matched: &Match) -> ProfilePoint {
+        if !matched.status.is_ok() {
+            return ProfilePoint::failed(matched, matched.status);
         }
-        None => ProfilePoint {
-            pixel_px,
-            point_mm: [f64::NAN; 3],
-            sigma_mm: [f64::NAN; 3],
-            gap_mm: f64::NAN,
-            status,
-        },
+        self.decoded(matched).unwrap_or_else(|_| ProfilePoint::failed(matched, PointStatus::Decode))
+    }
+
+    fn moved(
+        &self,
+        reference: ProfilePoint,
+        matched: &Match,
+        deformed: PixelPair,
+        tracking: [[f64; 2]; 2],
+    ) -> Result<DisplacementPoint, TraceError> {
+        let pixels = pixel_covariance([0.0; 2], matched.sigma_px);
+        let tracking = pixel_covariance(tracking[0], tracking[1]);
+        let found = self.model.track(matched.pair, deformed, &pixels, &tracking)?;
+        let by = self.model.displacement_parameter_jacobian(matched.pair, deformed)?;
+        Ok(DisplacementPoint {
+            reference,
+            displacement_mm: found.displacement_mm.into(),
+            independent_mm2: found.covariance_mm2,
+            common_mm2: self.common(&by),
+            status: PointStatus::Ok,
+        })
     }
 }
 
-fn point(model: &Microscope, matched: &Match) -> ProfilePoint {
-    if !matched.status.is_ok() {
-        return surface_point(None, matched, matched.status);
-    }
-    match model.decode_pair(matched.pair) {
-        Ok(decoded) => surface_point(Some(&decoded), matched, PointStatus::Ok),
-        Err(_) => surface_point(None, matched, PointStatus::Decode),
-    }
+/// Decodes the matched views of one frame, (3.4)–(3.5).
+pub fn profile(grid: &Grid, matches: &[Match], instrument: &Instrument) -> Profile {
+    let points: Vec<ProfilePoint> = matches.iter().map(|m| instrument.point(m)).collect();
+    let gap = GapField::fit(&points);
+    Profile { grid: grid.clone(), points, states_common: true, gap }
 }
 
-/// Decodes the matched views of one frame, (3.4)–(3.5); σ from the noise of the match.
-pub fn profile(grid: &Grid, matches: &[Match], model: &Microscope) -> Profile {
-    let points: Vec<ProfilePoint> = matches.iter().map(|m| point(model, m)).collect();
-    let gaps = || points.iter().filter(|p| p.status.is_ok()).map(|p| p.gap_mm);
-    let mean_gap_mm = gaps().sum::<f64>() / gaps().count() as f64;
-    Profile { grid: grid.clone(), points, mean_gap_mm }
-}
-
-/// Decodes matched points before and after, the +1 pixel being followed from the match of the −1 pixel (3.3); σ from
-/// the noise of match and tracking.
-pub fn displacement(grid: &Grid, matches: &[Match], tracks: &Tracks, model: &Microscope) -> Displacement {
+/// Decodes matched points before and after, the +1 pixel being followed from the match of the −1 pixel (3.3).
+pub fn displacement(
+    grid: &Grid,
+    matches: &[Match],
+    tracks: &Tracks,
+    instrument: &Instrument,
+) -> Displacement {
+    let Profile { points: before, gap, .. } = profile(grid, matches, instrument);
     let points = matches
         .iter()
+        .zip(before)
         .zip(&tracks.points)
-        .map(|(matched, track)| {
-            let reference = point(model, matched);
-            let without = |status| DisplacementPoint {
-                reference,
-                displacement_mm: [f64::NAN; 3],
-                sigma_mm: [f64::NAN; 3],
-                status,
-            };
+        .map(|((matched, reference), track)| {
             if !reference.status.is_ok() {
-                return without(reference.status);
+                return DisplacementPoint::failed(reference, reference.status);
             }
             if !track.status.is_ok() {
-                return without(track.status);
+                return DisplacementPoint::failed(reference, track.status);
             }
             let deformed = PixelPair { minus_px: track.minus_px, plus_px: track.plus_px };
-            let reference_px2 = pixel_covariance([0.0; 2], matched.sigma_px);
-            let tracking_px2 = pixel_covariance(track.sigma_minus_px, track.sigma_plus_px);
-            match model.track(matched.pair, deformed, &reference_px2, &tracking_px2) {
-                Ok(found) => DisplacementPoint {
-                    reference,
-                    displacement_mm: found.displacement_mm.into(),
-                    sigma_mm: [0, 1, 2].map(|i| found.covariance_mm2[(i, i)].sqrt()),
-                    status: PointStatus::Ok,
-                },
-                Err(_) => without(PointStatus::Decode),
-            }
+            let tracking = [track.sigma_minus_px, track.sigma_plus_px];
+            instrument
+                .moved(reference, matched, deformed, tracking)
+                .unwrap_or_else(|_| DisplacementPoint::failed(reference, PointStatus::Decode))
         })
         .collect();
-    Displacement { grid: grid.clone(), points }
+    Displacement { grid: grid.clone(), points, states_common: true, gap }
 }

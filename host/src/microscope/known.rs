@@ -1,11 +1,12 @@
 //! Calibration from moves whose frames have just been tracked.
 
-use super::{Calibrated, MicroscopeFile, field, page, run};
+use super::{Calibrated, Instrument, MicroscopeFile, field, page, run};
 use crate::error::Error;
 use crate::measure::{Match, Tracks};
 use daic_dataset::atomic;
 use daic_optics::microscope::calibrate::{FieldPoint, Motion, Settings, calibrate};
 use daic_optics::microscope::{Form, Microscope, MicroscopeError, Parameters};
+use nalgebra::SMatrix;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write as _;
 use std::path::Path;
@@ -46,9 +47,20 @@ pub struct CalibratedModel {
     pub parameters: Parameters,
     /// Disparity (x₊ − x₋, y₊ − y₋) where the height is 0, pixels.
     pub reference_disparity_px: [f64; 2],
+    /// Covariance of the parameters in the order of [`Parameters::to_array`]; lengths in millimetres.
+    pub covariance: [[f64; 6]; 6],
 }
 
 impl CalibratedModel {
+    /// Ready to decode.
+    ///
+    /// # Errors
+    /// The first parameter that no microscope has.
+    pub fn instrument(&self) -> Result<Instrument, MicroscopeError> {
+        let covariance = SMatrix::from_fn(|i, j| self.covariance[i][j]);
+        Ok(Instrument { model: self.model()?, covariance })
+    }
+
     /// The model.
     ///
     /// # Errors
@@ -146,5 +158,15 @@ fn calibrated_model(
     reference_disparity_px: [f64; 2],
 ) -> Result<CalibratedModel, MicroscopeError> {
     let model = file.model(reference_disparity_px)?;
-    Ok(CalibratedModel { form: model.form(), parameters: *model.parameters(), reference_disparity_px })
+    // of the file's micrometres, millimetres
+    let factor = [1e-3, 1e-3, 1.0, 1.0, 1.0, 1.0];
+    let covariance = file.microscope.covariance;
+    Ok(CalibratedModel {
+        form: model.form(),
+        parameters: *model.parameters(),
+        reference_disparity_px,
+        covariance: std::array::from_fn(|i| {
+            std::array::from_fn(|j| covariance[i][j] * factor[i] * factor[j])
+        }),
+    })
 }

@@ -19,7 +19,7 @@ use daic_optics::microscope::{Candidate, Form, Quantity};
 use serde::Serialize;
 use std::path::Path;
 
-pub use decode::{displacement, profile};
+pub use decode::{Instrument, displacement, profile};
 pub use file::{Fit, FittedMotion, MicroscopeFile, MicroscopeSection};
 pub use known::{CalibratedModel, KnownMove, MoveSettings, from_moves};
 pub use moves::{Component, Correlation, MotionEntry, Moves};

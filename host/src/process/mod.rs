@@ -15,13 +15,14 @@ pub use summary::{
 
 use crate::error::Error;
 use crate::expand;
-use crate::measure::{self, Displacement, Profile, Reference, spread};
+use crate::measure::{self, Displacement, Instrument, ObjectOptions, Profile, Reference, spread};
 use crate::optics_section;
 use crate::progress::Progress;
+use calibration::Calibrated;
 use daic_dataset::{Damage, Dataset, FrameRecord, FrameRole, Verdict, atomic, result_key};
 use daic_optics::{OpticalModel, Optics};
 use daic_protocol::program::Instruction;
-use daic_rig::experiment::{Experiment, OpticsFile};
+use daic_rig::experiment::{Covariance, Experiment, OpticsFile};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -82,22 +83,23 @@ pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Proc
         resumed: 0,
         failed: Vec::new(),
     };
-    let (instrument, calibration) = match &experiment.microscope {
+    let (source, calibration) = match &experiment.microscope {
         Some(_) => {
             let (model, calibration) = run.calibrated_microscope(&paired)?;
-            (Instrument::Microscope(model), Some(calibration))
+            (Source::Microscope(model), Some(calibration))
         }
         None => {
             let section = optics_section::of(&experiment)?;
-            let (optics, calibration) = run.calibrated(&paired, &optics_section::from_section(section)?)?;
-            write_optics(&dataset.results(), section, &optics, calibration.as_ref())?;
-            (Instrument::Macro(optics), calibration)
+            let calibrated = run.calibrated(&paired, &optics_section::from_section(section)?)?;
+            write_optics(&dataset.results(), section, &calibrated)?;
+            let summary = calibrated.summary.clone();
+            (Source::Macro(calibrated), summary)
         }
     };
-    let reference = run.profile(&instrument)?;
+    let reference = run.profile(&source)?;
     let mut measured = Vec::new();
     for record in paired.iter().filter(|r| r.role == FrameRole::Measurement) {
-        match run.displacement(record, &instrument) {
+        match run.displacement(record, &source) {
             Ok(result) => measured.push(result),
             // one bad frame does not stop a series
             Err(error @ (Error::Dataset(_) | Error::NothingMeasured { .. } | Error::Correlate(_))) => {
@@ -197,16 +199,16 @@ fn count(records: &[FrameRecord]) -> FrameCounts {
 }
 
 /// What makes points of pixel pairs.
-enum Instrument {
-    Macro(Optics),
+enum Source {
+    Macro(Calibrated),
     Microscope(crate::microscope::CalibratedModel),
 }
 
-impl Instrument {
+impl Source {
     /// All that its results depend on.
     fn settings(&self) -> Result<serde_json::Value, Error> {
         let value = match self {
-            Self::Macro(optics) => serde_json::to_value(optics),
+            Self::Macro(calibrated) => serde_json::to_value((&calibrated.optics, &calibrated.covariance)),
             Self::Microscope(model) => serde_json::to_value(model),
         };
         value.map_err(|source| Error::Unwritable { path: "key".into(), reason: source.to_string() })
@@ -232,6 +234,7 @@ struct StoredCalibration {
     key: String,
     summary: CalibrationSummary,
     optics: Optics,
+    covariance: Option<Covariance>,
 }
 
 impl Run<'_> {
@@ -270,18 +273,15 @@ impl Run<'_> {
         Some([0, 1, 2].map(|i| to[i] - from[i]))
     }
 
-    fn calibrated(
-        &mut self,
-        paired: &[&FrameRecord],
-        start: &Optics,
-    ) -> Result<(Optics, Option<CalibrationSummary>), Error> {
+    fn calibrated(&mut self, paired: &[&FrameRecord], start: &Optics) -> Result<Calibrated, Error> {
+        let as_stated = Calibrated { optics: *start, covariance: None, summary: None };
         let frames: Vec<(&FrameRecord, [f64; 3])> = paired
             .iter()
             .filter(|f| f.role == FrameRole::Calibration)
             .filter_map(|f| Some((*f, self.moved_um(f)?)))
             .collect();
         if frames.is_empty() || !self.experiment.processing.calibrate {
-            return Ok((*start, None));
+            return Ok(as_stated);
         }
         let mut inputs = vec![self.reference_record];
         inputs.extend(frames.iter().map(|f| f.0));
@@ -292,7 +292,8 @@ impl Run<'_> {
             && stored.key == key
         {
             self.resumed += 1;
-            return Ok((stored.optics, Some(stored.summary)));
+            let StoredCalibration { optics, covariance, summary, .. } = stored;
+            return Ok(Calibrated { optics, covariance, summary: Some(summary) });
         }
         let mut moved = Vec::new();
         for (record, move_um) in frames {
@@ -310,16 +311,34 @@ impl Run<'_> {
         }
         self.progress.stage("calibrating", 0);
         let axis_height_mm = self.experiment.processing.axis_height.mm();
-        let shared = calibration::shared_information(&self.settings);
+        let shared = self.settings.points_per_measurement();
         let matches = &self.reference()?.matches;
-        let (optics, summary) = calibration::run(start, matches, &moved, axis_height_mm, shared)?;
-        write_json(&path, &StoredCalibration { key, summary: summary.clone(), optics })?;
-        Ok((optics, Some(summary)))
+        let found = calibration::run(start, matches, &moved, axis_height_mm, shared)?;
+        if let Some(summary) = found.summary.clone() {
+            let covariance = found.covariance.clone();
+            write_json(&path, &StoredCalibration { key, summary, optics: found.optics, covariance })?;
+        }
+        Ok(found)
     }
 
-    fn profile(&mut self, instrument: &Instrument) -> Result<ReferenceResult, Error> {
+    fn instrument(&self, calibrated: &Calibrated) -> Result<Instrument, Error> {
+        let model = OpticalModel::new(&calibrated.optics)?;
+        let decoder = crate::settings::decoder(self.experiment.processing.decoder);
+        let mut instrument = Instrument::new(model, decoder);
+        let path = self.dataset.results().join("optics.toml");
+        if let Some(covariance) = &calibrated.covariance {
+            instrument.calibration = Some(optics_section::covariance_of(covariance, &path)?);
+        }
+        Ok(instrument)
+    }
+
+    fn object(&self) -> ObjectOptions {
+        ObjectOptions { step_mm: None, overlap: self.settings.overlap() }
+    }
+
+    fn profile(&mut self, source: &Source) -> Result<ReferenceResult, Error> {
         let record = self.reference_record;
-        let key = self.key(&instrument.settings()?, &[record])?;
+        let key = self.key(&source.settings()?, &[record])?;
         let directory = self.dataset.frame_results(record.id);
         if !self.fresh
             && self.dataset.is_done(record.id, &key)
@@ -328,33 +347,35 @@ impl Run<'_> {
             self.resumed += 1;
             return Ok(done);
         }
-        let decoder = crate::settings::decoder(self.experiment.processing.decoder);
-        let reference = self.reference()?;
-        let profile = match instrument {
-            Instrument::Macro(optics) => {
-                let model = OpticalModel::new(optics)?;
-                measure::profile(&reference.grid, &reference.matches, &model, decoder)
+        let (object, shared) = (self.object(), self.settings.points_per_measurement());
+        let profile = match source {
+            Source::Macro(calibrated) => {
+                let instrument = self.instrument(calibrated)?;
+                let reference = self.reference()?;
+                measure::profile(&reference.grid, &reference.matches, &instrument)
             }
-            Instrument::Microscope(model) => {
-                crate::microscope::profile(&reference.grid, &reference.matches, &model.model()?)
+            Source::Microscope(model) => {
+                let reference = self.reference()?;
+                crate::microscope::profile(&reference.grid, &reference.matches, &model.instrument()?)
             }
         }
         .with_points()?;
+        let reference = self.reference()?;
         let corners = |r: measure::Rectangle| [r.x, r.y, r.width, r.height];
         let result = ReferenceResult {
-            profile: profile_summary(&profile),
+            profile: profile_summary(&profile, shared),
             minus: corners(reference.minus),
             plus: corners(reference.plus),
         };
         let directory = self.dataset.begin_results(record.id)?;
-        measure::write_profile(&directory, &profile)?;
+        measure::write_profile(&directory, &profile, &object)?;
         write_json(&directory.join("result.json"), &result)?;
         self.dataset.mark_done(record.id, &key)?;
         Ok(result)
     }
 
-    fn displacement(&mut self, record: &FrameRecord, instrument: &Instrument) -> Result<FrameSummary, Error> {
-        let key = self.key(&instrument.settings()?, &[self.reference_record, record])?;
+    fn displacement(&mut self, record: &FrameRecord, source: &Source) -> Result<FrameSummary, Error> {
+        let key = self.key(&source.settings()?, &[self.reference_record, record])?;
         let directory = self.dataset.frame_results(record.id);
         if !self.fresh
             && self.dataset.is_done(record.id, &key)
@@ -364,51 +385,59 @@ impl Run<'_> {
             return Ok(done);
         }
         let image = self.dataset.read_frame(record)?;
-        let decoder = crate::settings::decoder(self.experiment.processing.decoder);
+        let object = self.object();
         let commanded_um = self.moved_um(record);
         let (progress, settings) = (self.progress, self.settings.clone());
         let reference = self.reference()?;
         let tracks = reference.track(&image, progress)?;
-        let (grid, matches) = (&reference.grid, &reference.matches);
-        let displacement = match instrument {
-            Instrument::Macro(optics) => {
-                let model = OpticalModel::new(optics)?;
-                measure::displacement(grid, matches, &tracks, &model, decoder, settings.height_mm)
+        let displacement = match source {
+            Source::Macro(calibrated) => {
+                let instrument = self.instrument(calibrated)?;
+                let Reference { grid, matches, .. } = self.reference()?;
+                measure::displacement(grid, matches, &tracks, &instrument, settings.height_mm)
             }
-            Instrument::Microscope(model) => {
-                crate::microscope::displacement(grid, matches, &tracks, &model.model()?)
+            Source::Microscope(model) => {
+                let Reference { grid, matches, .. } = self.reference()?;
+                crate::microscope::displacement(grid, matches, &tracks, &model.instrument()?)
             }
         }
         .with_points()?;
-        let result = frame_summary(record, commanded_um, &displacement);
+        let shared = settings.points_per_measurement();
+        let result = frame_summary(record, commanded_um, &displacement, shared);
         let directory = self.dataset.begin_results(record.id)?;
-        measure::write_displacement(&directory, &displacement)?;
+        measure::write_displacement(&directory, &displacement, None, &object)?;
         write_json(&directory.join("result.json"), &result)?;
         self.dataset.mark_done(record.id, &key)?;
         Ok(result)
     }
 }
 
-/// A profile in numbers.
-pub fn profile_summary(profile: &Profile) -> ProfileSummary {
+/// A profile in numbers; `shared` points have one independent measurement between them
+/// ([`measure::Settings::points_per_measurement`]).
+pub fn profile_summary(profile: &Profile, shared: f64) -> ProfileSummary {
     let ok = || profile.points.iter().filter(|p| p.status.is_ok());
     ProfileSummary {
         points: profile.points.len(),
         ok: ok().count(),
         mean_h_mm: spread(ok().map(|p| p.point_mm[2])).mean,
-        sigma_h_um: 1e3 * spread(ok().map(|p| p.sigma_mm[2])).rms,
-        mean_gap_um: 1e3 * profile.mean_gap_mm,
+        sigma_h_um: 1e3 * spread(ok().map(|p| p.sigma_mm()[2])).rms,
+        sigma_h_cal_um: profile.states_common.then(|| 1e3 * spread(ok().map(|p| p.common_sigma_mm()[2])).rms),
+        gap: profile.gap_summary(shared),
     }
 }
 
-/// A displacement field in numbers.
-pub fn field_summary(displacement: &Displacement) -> FieldSummary {
+/// A displacement field in numbers; `shared` as in [`profile_summary`].
+pub fn field_summary(displacement: &Displacement, shared: f64) -> FieldSummary {
     let ok = || displacement.points.iter().filter(|p| p.status.is_ok());
     let axis = |i: usize| spread(ok().map(|p| 1e3 * p.displacement_mm[i]));
     FieldSummary {
         measured_um: [0, 1, 2].map(|i| axis(i).mean),
         std_um: [0, 1, 2].map(|i| axis(i).std),
-        sigma_um: [0, 1, 2].map(|i| 1e3 * spread(ok().map(|p| p.sigma_mm[i])).rms),
+        sigma_um: [0, 1, 2].map(|i| 1e3 * spread(ok().map(|p| p.sigma_mm()[i])).rms),
+        sigma_cal_um: displacement
+            .states_common
+            .then(|| [0, 1, 2].map(|i| 1e3 * spread(ok().map(|p| p.common_sigma_mm()[i])).rms)),
+        gap: displacement.gap_summary(shared),
         points: displacement.points.len(),
         ok: ok().count(),
     }
@@ -418,6 +447,7 @@ fn frame_summary(
     record: &FrameRecord,
     commanded_um: Option<[f64; 3]>,
     displacement: &Displacement,
+    shared: f64,
 ) -> FrameSummary {
     let ok = || displacement.points.iter().filter(|p| p.status.is_ok());
     let against =
@@ -427,7 +457,7 @@ fn frame_summary(
         name: record.name.clone(),
         commanded_um,
         rms_um: commanded_um.map(against),
-        field: field_summary(displacement),
+        field: field_summary(displacement, shared),
     }
 }
 
@@ -463,10 +493,9 @@ fn run_begin(dataset: &Dataset) -> Result<Option<u64>, Error> {
 fn write_optics(
     directory: &Path,
     section: &daic_rig::experiment::Optics,
-    optics: &Optics,
-    calibration: Option<&CalibrationSummary>,
+    calibrated: &Calibrated,
 ) -> Result<(), Error> {
-    let provenance = calibration.map_or_else(
+    let provenance = calibrated.summary.as_ref().map_or_else(
         || "as in the experiment file, not calibrated".to_owned(),
         |c| format!("focal, distances calibrated from {} points, residual {:.4} px RMS", c.points, c.rms_px),
     );
@@ -474,8 +503,10 @@ fn write_optics(
         format: Some(OpticsFile::FORMAT.to_owned()),
         provenance: Some(provenance),
         date: None,
-        covariance: None,
-        optics: optics_section::with_calibrated(section, optics),
+        covariance: calibrated.covariance.clone(),
+        maps: None,
+        volume: None,
+        optics: optics_section::with_calibrated(section, &calibrated.optics),
     };
     let path = directory.join("optics.toml");
     let text = file

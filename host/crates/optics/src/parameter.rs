@@ -1,6 +1,6 @@
 //! The quantities of a set-up that can be estimated or carry an uncertainty.
 
-use nalgebra::{DMatrix, Matrix3, SMatrix, Vector3};
+use nalgebra::{DMatrix, SMatrix, SVector};
 use serde::{Deserialize, Serialize};
 
 use crate::setup::{Optics, View};
@@ -299,7 +299,7 @@ pub struct ParameterJacobian<const R: usize>(pub SMatrix<f64, R, { Parameter::CO
 
 impl<const R: usize> ParameterJacobian<R> {
     /// Derivatives with respect to one parameter, per unit of its field.
-    pub fn by(&self, parameter: Parameter) -> nalgebra::SVector<f64, R> {
+    pub fn by(&self, parameter: Parameter) -> SVector<f64, R> {
         self.0.column(parameter.index()).into_owned()
     }
 }
@@ -406,16 +406,20 @@ impl ParameterCovariance {
         self.parameters.iter().position(|p| *p == parameter).map_or(0.0, |i| self.matrix[(i, i)].sqrt())
     }
 
-    /// Covariance (mm²) that it causes between two points with these derivatives; the covariance of
-    /// one point where both are the same.
-    pub fn between(&self, a: &ParameterJacobian<3>, b: &ParameterJacobian<3>) -> Matrix3<f64> {
-        let by = |j: &ParameterJacobian<3>| -> Vec<Vector3<f64>> {
+    /// Covariance that it causes between two quantities with these derivatives, two points (mm²) for
+    /// instance; the covariance of one where both are the same.
+    pub fn between<const R: usize>(
+        &self,
+        a: &ParameterJacobian<R>,
+        b: &ParameterJacobian<R>,
+    ) -> SMatrix<f64, R, R> {
+        let by = |j: &ParameterJacobian<R>| -> Vec<SVector<f64, R>> {
             self.parameters.iter().map(|p| j.by(*p)).collect()
         };
         let (a, b) = (by(a), by(b));
-        let mut sum = Matrix3::zeros();
+        let mut sum = SMatrix::zeros();
         for (i, a) in a.iter().enumerate() {
-            let mut row = Vector3::zeros();
+            let mut row = SVector::zeros();
             for (j, b) in b.iter().enumerate() {
                 row += b * self.matrix[(i, j)];
             }

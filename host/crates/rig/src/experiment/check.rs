@@ -91,6 +91,19 @@ pub(super) fn optics_file(file: &OpticsFile) -> Vec<Finding> {
             }
         }
     }
+    let maps = file.maps.clone().unwrap_or_default();
+    for (name, map) in [("sensor", maps.sensor), ("minus", maps.minus), ("plus", maps.plus)] {
+        let Some(map) = map else { continue };
+        f.require(!map.file.trim().is_empty(), format!("maps.{name}.file"), "empty", "the path of a map");
+        let hex = map.crc64.len() == 16 && map.crc64.bytes().all(|b| b.is_ascii_hexdigit());
+        f.require(hex, format!("maps.{name}.crc64"), format!("{:?}", map.crc64), "16 hexadecimal digits");
+    }
+    if let Some(v) = &file.volume {
+        for (name, [from, to]) in [("x", v.x), ("y", v.y), ("h", v.h)] {
+            let text = format!("{from} to {to}");
+            f.require(from.mm() < to.mm(), format!("volume.{name}"), text, "from the smaller to the larger");
+        }
+    }
     f.0
 }
 

@@ -14,7 +14,9 @@ mod rig;
 mod sequence;
 
 pub use microscope::{Microscope, MicroscopeForm};
-pub use optics::{Brown, Covariance, Grating, Optics, OpticsFile, Reference, Side, Substrate};
+pub use optics::{
+    Brown, Covariance, Grating, MapFile, Maps, Optics, OpticsFile, Reference, Side, Substrate, Volume,
+};
 pub use problem::{ConfigError, Problem, ProblemKind};
 pub use processing::{Criterion, Decoder, Interpolation, Processing, Shape, Solver};
 pub use rig::{Axes, Axis, Bayer, BayerChannel, BayerPattern, CameraSection, CameraSource, Rig, Strobe};
@@ -96,7 +98,15 @@ impl OpticsFile {
             let Some(optics) = experiment.optics else {
                 return Err(ConfigError::NoOptics { path: path.to_owned() });
             };
-            return Ok(Self { format: None, provenance: None, date: None, optics, covariance: None });
+            return Ok(Self {
+                format: None,
+                provenance: None,
+                date: None,
+                optics,
+                covariance: None,
+                maps: None,
+                volume: None,
+            });
         }
         let file: Self = problem::from_toml(text, path)?;
         problem::report(text, path, check::optics_file(&file))?;
