@@ -1,4 +1,4 @@
-//! The one entry for people and CI: `cargo xtask test | lint | figures | bench`.
+//! The one entry for people and CI: `cargo xtask test | lint | figures | reproduce | bench`.
 //!
 //! Every step runs even when an earlier one failed, and the end names what passed, what failed
 //! and what could not be run on this machine, with the reason.
@@ -16,6 +16,8 @@ cargo xtask COMMAND
   lint       formatting, clippy, documentation without warnings, cargo-deny where installed
   ci         test, then lint
   figures    draws the pictures of README and docs anew with the program itself
+  reproduce  macro: chapter 2 of the thesis, micro: chapter 3, simulated and measured, into
+             docs/reproduction.md
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders
              guard [--update]: instruction counts against the baseline (or: makes a new one)
@@ -33,6 +35,7 @@ fn main() -> ExitCode {
             report
         }
         ["figures"] => steps::figures(),
+        ["reproduce", chapter @ ("macro" | "micro")] => steps::reproduce(chapter),
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),
         ["bench", "optics"] => steps::bench_optics(),
