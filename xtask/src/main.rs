@@ -1,4 +1,4 @@
-//! The one entry for people and CI: `cargo xtask test | lint | figures | bench`.
+//! The one entry for people and CI: `cargo xtask test | lint | figures | reproduce | bench`.
 //!
 //! Every step runs even when an earlier one failed, and the end names what passed, what failed
 //! and what could not be run on this machine, with the reason.
@@ -17,6 +17,8 @@ cargo xtask COMMAND
   ci         test, then lint
   figures    draws the pictures of README and docs anew with the program itself
   coverage   2 000 simulated calibrations: what the stated uncertainties cover (minutes)
+  reproduce  macro: chapter 2 of the thesis, micro: chapter 3, simulated and measured, into
+             docs/reproduction.md
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders
              guard [--update]: instruction counts against the baseline (or: makes a new one)
@@ -35,6 +37,7 @@ fn main() -> ExitCode {
         }
         ["figures"] => steps::figures(),
         ["coverage"] => steps::coverage(),
+        ["reproduce", chapter @ ("macro" | "micro")] => steps::reproduce(chapter),
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),
         ["bench", "optics"] => steps::bench_optics(),

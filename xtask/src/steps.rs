@@ -200,6 +200,19 @@ pub fn coverage() -> Report {
     report
 }
 
+/// A chapter of the thesis into docs/reproduction.md.
+pub fn reproduce(chapter: &str) -> Report {
+    let mut report = Report::default();
+    report.step(&format!("reproduction of the thesis: {chapter}"), || {
+        let program =
+            ["run", "--release", "--locked", "--package", "daic-tests", "--example", "reproduce", "--"];
+        let mut command = cargo(&program);
+        command.arg(chapter).arg(root().join("docs"));
+        outcome_of(command)
+    });
+    report
+}
+
 /// Speed of the optics.
 pub fn bench_optics() -> Report {
     let mut report = Report::default();

@@ -223,7 +223,7 @@ pub enum SurfaceConfig {
         /// Height of a plane that the cone rises from.
         floor_mm: Option<f64>,
     },
-    /// Two levels with a vertical wall: h = low where X < x, high where X ≥ x.
+    /// Two levels with a vertical wall: h = low where X cos a + Y sin a < x, high beyond.
     Step {
         /// Where the wall stands.
         x_mm: f64,
@@ -231,6 +231,9 @@ pub enum SurfaceConfig {
         low_mm: f64,
         /// Height right of it; may be the lower one.
         high_mm: f64,
+        /// Direction a from X towards Y in which the wall is crossed.
+        #[serde(default)]
+        direction_rad: f64,
     },
     /// h = √(R² − X² − Y²) − R + apex.
     Sphere {

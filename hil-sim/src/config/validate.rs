@@ -147,8 +147,9 @@ impl SurfaceConfig {
                 within("surface.slope", *slope, 1e-9, 100.0)?;
                 finite("surface.apex_mm, floor_mm", &[*apex_mm, floor_mm.unwrap_or(0.0)])
             }
-            Self::Step { x_mm, low_mm, high_mm } => {
-                finite("surface.x_mm, low_mm, high_mm", &[*x_mm, *low_mm, *high_mm])
+            Self::Step { x_mm, low_mm, high_mm, direction_rad } => {
+                finite("surface.x_mm, low_mm, high_mm", &[*x_mm, *low_mm, *high_mm])?;
+                within("surface.direction_rad", *direction_rad, -4.0, 4.0)
             }
             Self::HeightMap { pixel_mm, black_mm, white_mm, .. } => {
                 positive("surface.pixel_mm", *pixel_mm)?;
