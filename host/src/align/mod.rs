@@ -339,7 +339,14 @@ pub fn distance(camera: &CameraFile, image: &Path, options: &BoardOptions) -> Re
     // The longest row, from its first to its last point.
     let row = |p: &daic_optics::target::TargetPoint| p.index[1];
     let ends = target.points.chunk_by(|a, b| row(a) == row(b)).map(|r| (r[0], r[r.len() - 1]));
-    let Some((a, b)) = ends.max_by_key(|(a, b)| b.index[0] - a.index[0]) else {
+    // of the longest rows the one nearest the axis: D is counted along it
+    let axis = camera.camera.principal_point_px[1];
+    let off = |(a, b): &(daic_optics::target::TargetPoint, daic_optics::target::TargetPoint)| {
+        (0.5 * (a.at_px[1] + b.at_px[1]) - axis).abs()
+    };
+    let longest = ends.clone().map(|(a, b)| b.index[0] - a.index[0]).max();
+    let rows = ends.filter(|(a, b)| Some(b.index[0] - a.index[0]) == longest);
+    let Some((a, b)) = rows.min_by(|p, q| off(p).total_cmp(&off(q))) else {
         return Err(at(image)(AlignError::Spots { found: 0, needed: 2 }));
     };
     let ideal = |p: [f64; 2]| camera.camera.undistort_px(p).map_err(|e| at(image)(e.into()));
