@@ -4,7 +4,8 @@
 //! (numbers of one's own choice, the same point the same number in every pose), `plate_x_mm`,
 //! `plate_y_mm` (empty where unknown), `minus_x`, `minus_y`, `plus_x`, `plus_y` (pixels, empty where
 //! a view does not show it) and, if not one for all, `sigma_px`. The table of moves, where the stage's are known,
-//! has `pose`, `x_mm`, `y_mm`, `h_mm` against the reference pose (empty where unknown).
+//! has `pose`, `x_mm`, `y_mm`, `h_mm` against the reference pose (empty where unknown) and perhaps `rx_deg`, `ry_deg`,
+//! `rz_deg` with `sigma_deg`: the plate's rotation about x, then y, then z.
 
 use crate::error::Error;
 use crate::optics_file::{self, CalibratedOptics};
@@ -77,8 +78,12 @@ pub struct Summary {
     pub chi_square_reduced: f64,
     /// Pixels left out.
     pub rejected: usize,
-    /// Poses predicted without themselves.
+    /// Poses predicted without themselves; one without which the others leave something open is not among them.
     pub left_out: Vec<Predicted>,
+    /// Size of the plate by the moves over its stated size, and its standard deviation, where both are known.
+    pub plate_scale: Option<[f64; 2]>,
+    /// Angles of the stage's axes against the object frame, mrad, where moves are known.
+    pub stage_axes_mrad: Option<[f64; 3]>,
     /// The optics file.
     pub optics: PathBuf,
 }
@@ -90,7 +95,7 @@ pub struct Summary {
 pub fn run(options: &Options) -> Result<Summary, Error> {
     let from = CalibratedOptics::load(&options.optics)?;
     let (file, start) = (&from.file, from.optics);
-    let (mut data, poses) = read_points(&options.points, options.sigma_px)?;
+    let (mut data, poses, points) = read_points(&options.points, options.sigma_px)?;
     if let Some(moves) = &options.moves {
         read_moves(moves, options.move_sigma_mm, &poses, &mut data)?;
     }
@@ -107,7 +112,12 @@ pub fn run(options: &Options) -> Result<Summary, Error> {
             }
         })?;
     }
-    let found = calibrate_rig(&start, &from.maps(), &data, &settings)?;
+    let found = calibrate_rig(&start, &from.maps(), &data, &settings).map_err(|source| {
+        let (pose, point) = source.place();
+        let own = |numbers: &[i64], at: Option<usize>| at.and_then(|at| numbers.get(at).copied());
+        let (pose, point) = (own(&poses, pose), own(&points, point));
+        Error::CalibrateRig { path: options.points.clone(), source, pose, point }
+    })?;
     let page = page(&found, &poses)?;
     let path = options.out.join("optics.toml");
     std::fs::create_dir_all(&options.out)
@@ -127,7 +137,7 @@ pub fn run(options: &Options) -> Result<Summary, Error> {
 ///
 /// # Errors
 /// The file, or the row and column that cannot be used.
-pub fn read_points(path: &Path, sigma_px: f64) -> Result<(RigData, Vec<i64>), Error> {
+pub fn read_points(path: &Path, sigma_px: f64) -> Result<(RigData, Vec<i64>, Vec<i64>), Error> {
     let table = Table::read_csv(path)?;
     let column = |name: &str| table.numbers(name, path);
     let poses = whole(path, "pose", &column("pose")?)?;
@@ -165,13 +175,19 @@ pub fn read_points(path: &Path, sigma_px: f64) -> Result<(RigData, Vec<i64>), Er
         let sighting = Sighting { point, minus: seen(&minus), plus: seen(&plus) };
         data.poses[pose_at[&poses[row]]].sightings.push(sighting);
     }
-    Ok((data, pose_at.into_keys().collect()))
+    Ok((data, pose_at.into_keys().collect(), point_at.into_keys().collect()))
 }
 
 fn read_moves(path: &Path, sigma: f64, poses: &[i64], data: &mut RigData) -> Result<(), Error> {
     let table = Table::read_csv(path)?;
     let numbers = whole(path, "pose", &table.numbers("pose", path)?)?;
     let columns = [table.numbers("x_mm", path)?, table.numbers("y_mm", path)?, table.numbers("h_mm", path)?];
+    // rotations of a goniometer are known to a sigma of their own, or not at all
+    let number = |name: &str| table.numbers(name, path);
+    let turned = match table.column("rx_deg") {
+        Some(_) => Some(([number("rx_deg")?, number("ry_deg")?, number("rz_deg")?], number("sigma_deg")?)),
+        None => None,
+    };
     for (row, number) in numbers.iter().enumerate() {
         let Some(k) = poses.iter().position(|p| p == number) else {
             let (path, value) = (path.to_owned(), *number as f64);
@@ -180,6 +196,13 @@ fn read_moves(path: &Path, sigma: f64, poses: &[i64], data: &mut RigData) -> Res
         };
         data.poses[k].known.translation_mm = [0, 1, 2]
             .map(|i| Some(columns[i][row]).filter(|v| !v.is_nan()).map(|value| Known { value, sigma }));
+        if let Some((angles, sigma_deg)) = &turned {
+            let sigma = sigma_deg[row].to_radians();
+            data.poses[k].known.rotation_rad = [0, 1, 2].map(|i| {
+                let angle = Some(angles[i][row]).filter(|v| !v.is_nan());
+                angle.map(|deg| Known { value: deg.to_radians(), sigma })
+            });
+        }
     }
     Ok(())
 }
@@ -205,7 +228,7 @@ fn to_file(start: &OpticsFile, found: &RigCalibration, poses: usize) -> OpticsFi
             found.rms_px,
             found.chi_square_reduced
         )),
-        date: Some(humantime::format_rfc3339_seconds(std::time::SystemTime::now()).to_string()),
+        date: Some(crate::camera_file::now()),
         optics: optics_section::to_section(&start.optics, &found.optics),
         covariance: Some(Covariance {
             parameters: names.collect(),
@@ -239,6 +262,8 @@ fn summary(found: &RigCalibration, poses: &[i64], optics: PathBuf) -> Summary {
             })
             .collect(),
         left_to_priors: combinations(found),
+        plate_scale: found.plate_scale.map(|s| [s.value, s.sigma]),
+        stage_axes_mrad: found.stage_axes_rad.map(|axes| axes.map(|a| 1e3 * a)),
         rms_px: found.rms_px,
         chi_square_reduced: found.chi_square_reduced,
         rejected: found.rejected.len(),

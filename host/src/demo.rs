@@ -146,7 +146,7 @@ pub fn run(options: &Options, progress: &dyn Progress) -> Result<DemoSummary, Er
         }
     };
     record(&experiment, config, &options.out, Existing::ReplaceKind(DEMO), progress)?;
-    let mut processed = process::process(&options.out, false, progress)?;
+    let mut processed = process::process(&options.out, false, None, progress)?;
     processed.wall_s = Some(begin.elapsed().as_secs_f64());
     complete(&options.out, &processed)?.ok_or(Error::NoResult { path: options.out.join("dataset.json") })
 }

@@ -97,6 +97,24 @@ pub enum Error {
         /// What it says.
         meaning: &'static str,
     },
+    /// Optics of a grating set-up for a dataset under the microscope.
+    #[error("{} is an optics file, the dataset {} was taken under a microscope and is calibrated by its own moves", optics.display(), root.display())]
+    NotForMicroscope {
+        /// The optics file.
+        optics: PathBuf,
+        /// The dataset.
+        root: PathBuf,
+    },
+    /// Two inputs whose results would have the same name.
+    #[error("{} and {} would both be written as {}; rename one, or give them folders of their own with --out", first.display(), second.display(), file.display())]
+    SameName {
+        /// The first.
+        first: PathBuf,
+        /// The second.
+        second: PathBuf,
+        /// The result.
+        file: PathBuf,
+    },
     /// A folder in which no image appeared.
     #[error("{}: no new image came within {seconds} s; let the camera's program write into this folder", folder.display())]
     NoImageCame {
@@ -170,8 +188,17 @@ pub enum Error {
     #[error("the strain on the surface cannot be computed: {0}")]
     SurfaceStrain(#[from] daic_optics::surface::SurfaceError),
     /// The rig could not be calibrated.
-    #[error("no calibration of the rig: {0}")]
-    CalibrateRig(#[from] daic_optics::RigError),
+    #[error("{}: no calibration of the rig: {source}{}", path.display(), own_numbers(*pose, *point))]
+    CalibrateRig {
+        /// The table of points.
+        path: PathBuf,
+        /// Why; its poses and points count from 0 in the order of the table's numbers.
+        source: daic_optics::RigError,
+        /// The table's own number of the pose to blame, if one is.
+        pose: Option<i64>,
+        /// The table's own number of the point.
+        point: Option<i64>,
+    },
     /// The distortion could not be calibrated.
     #[error("no calibration of the distortion: {0}")]
     CalibrateDistortion(#[from] daic_optics::DistortionError),
@@ -582,5 +609,15 @@ impl Error {
             Self::Config(error) | Self::Rig(daic_rig::RigError::Config(error)) => Some(error),
             _ => None,
         }
+    }
+}
+
+/// How the numbers of a message that counts from 0 read in the user's table.
+fn own_numbers(pose: Option<i64>, point: Option<i64>) -> String {
+    match (pose, point) {
+        (Some(pose), Some(point)) => format!(" (in the table: pose {pose}, point {point})"),
+        (Some(pose), None) => format!(" (in the table: pose {pose})"),
+        (None, Some(point)) => format!(" (in the table: point {point})"),
+        (None, None) => String::new(),
     }
 }

@@ -59,6 +59,19 @@ impl CalibratedOptics {
         })
     }
 
+    /// The file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Everything that results depend on, maps by their checksums, as text.
+    ///
+    /// # Errors
+    /// If it cannot be written as TOML.
+    pub fn key(&self) -> Result<String, Error> {
+        self.file.to_toml().map_err(|e| Error::Unwritable { path: self.path.clone(), reason: e.to_string() })
+    }
+
     /// All maps.
     pub fn maps(&self) -> DistortionMaps {
         let [sensor, minus, plus] = self.maps.each_ref().map(|m| m.as_ref().map(|m| Arc::new(m.e.clone())));

@@ -6,7 +6,6 @@ use crate::measure::{
     self, Displacement, GapSummary, Profile, Reference, Settings, SurfaceField, map_named, plane_of, spread,
 };
 use daic_dataset::{FloatMap, GreyImage};
-use daic_optics::Decoder;
 use daic_report::{Cell, Figure, Report, Section, TableBlock, plain};
 
 fn views(frame: &GreyImage, reference: &Reference) -> Result<Section, Error> {
@@ -24,11 +23,11 @@ fn views(frame: &GreyImage, reference: &Reference) -> Result<Section, Error> {
     })
 }
 
-fn provenance(decoder: Decoder, settings: &Settings) -> Vec<(String, String)> {
+fn provenance(decoder: &str, settings: &Settings) -> Vec<(String, String)> {
     let dic = &settings.dic;
     vec![
         ("measured with".to_owned(), format!("daic {}", env!("CARGO_PKG_VERSION"))),
-        ("decoder".to_owned(), format!("{decoder:?}").to_lowercase()),
+        ("decoder".to_owned(), decoder.to_owned()),
         ("subset, step".to_owned(), format!("{0} × {0} px, every {1} px", dic.subset, settings.step)),
         ("shape function".to_owned(), format!("{:?}", dic.shape).to_lowercase()),
         ("interpolation".to_owned(), format!("{:?} B-spline", dic.interpolation).to_lowercase()),
@@ -80,8 +79,8 @@ pub fn profile_page(
     frame: &GreyImage,
     reference: &Reference,
     profile: &Profile,
-    linear: &Profile,
-    decoder: Decoder,
+    linear: Option<&Profile>,
+    decoder: &str,
     settings: &Settings,
 ) -> Result<String, Error> {
     let maps = measure::profile_maps(profile);
@@ -136,6 +135,26 @@ pub fn profile_page(
             pictures.push(figures::map_figure(map, title, "σ", Unit::Micrometre, caption)?);
         }
     }
+    let mut sections = vec![
+        Section { title: "Surface".to_owned(), text: Vec::new(), tables: vec![numbers], figures: pictures },
+        consistency(&maps, &profile.gap_summary(settings.points_per_measurement()))?,
+        views(frame, reference)?,
+    ];
+    if let Some(linear) = linear {
+        sections.push(of_linear(profile, linear, &height)?);
+    }
+    let report = Report {
+        title: "daic profile".to_owned(),
+        subtitle: "Height of a surface from the two first-order views of one frame".to_owned(),
+        verdict: None,
+        sections,
+        provenance: provenance(decoder, settings),
+    };
+    Ok(report.render()?)
+}
+
+/// What the decoder `linear` makes of the same matches.
+fn of_linear(profile: &Profile, linear: &Profile, height: &FloatMap) -> Result<Section, Error> {
     let difference = linear_minus(profile, linear);
     let offset = spread(difference.iter().map(|d| d[2]));
     let mut text = vec![format!(
@@ -159,35 +178,18 @@ pub fn profile_page(
         let (a, b) = (&profile.points[k], &linear.points[k]);
         if a.status.is_ok() && b.status.is_ok() { b.point_mm[2] - a.point_mm[2] } else { f64::NAN }
     });
-    let report = Report {
-        title: "daic profile".to_owned(),
-        subtitle: "Height of a surface from the two first-order views of one frame".to_owned(),
-        verdict: None,
-        sections: vec![
-            Section {
-                title: "Surface".to_owned(),
-                text: Vec::new(),
-                tables: vec![numbers],
-                figures: pictures,
-            },
-            consistency(&maps, &profile.gap_summary(settings.points_per_measurement()))?,
-            views(frame, reference)?,
-            Section {
-                title: "What the linearised model makes of it".to_owned(),
-                text,
-                tables: Vec::new(),
-                figures: vec![figures::map_figure(
-                    &map,
-                    "Height by `linear` minus height here",
-                    "Δh",
-                    Unit::Micrometre,
-                    "",
-                )?],
-            },
-        ],
-        provenance: provenance(decoder, settings),
-    };
-    Ok(report.render()?)
+    Ok(Section {
+        title: "What the linearised model makes of it".to_owned(),
+        text,
+        tables: Vec::new(),
+        figures: vec![figures::map_figure(
+            &map,
+            "Height by `linear` minus height here",
+            "Δh",
+            Unit::Micrometre,
+            "",
+        )?],
+    })
 }
 
 /// (x, y, Δh) in mm, mm, µm where both decoders have a point.
@@ -210,7 +212,7 @@ pub fn displacement_page(
     reference: &Reference,
     field: &Displacement,
     strain: Option<&SurfaceField>,
-    decoder: Decoder,
+    decoder: &str,
     settings: &Settings,
 ) -> Result<String, Error> {
     let all = measure::displacement_maps(field, strain);

@@ -202,6 +202,17 @@ fn the_rest_of_the_alignment(folder: &Path, camera_file: &Path, record: &Path, l
     let files = ["--optics", path(&example), "--out", path(&optics), "--first-grating", "plus"];
     on(&[&["distance", path(&image)][..], &board[..], &files[..]].concat());
     let written = daic_rig::experiment::OpticsFile::load(&optics).expect("valid");
+    let covariance = daic::optics_section::covariance(&written, &optics).expect("valid").expect("stated");
+    let sigma = |name: &str| {
+        let k = covariance.parameters().iter().position(|p| p.name() == name).expect(name);
+        covariance.matrix()[(k, k)].sqrt()
+    };
+    assert!((sigma("grating_to_reference_mm") - 0.05).abs() < 1e-9);
+    // d of the caliper, 0.05 mm, and D by F, pose and pitch
+    assert!(sigma("pinhole_to_grating_mm") > 0.05 && sigma("pinhole_to_grating_mm") < 0.07);
+    assert!(sigma("plus.tilt_rad_xyz[1]") > 0.0 && written.date.is_some());
+    let provenance = written.provenance.as_ref().expect("stated");
+    assert!(provenance.contains("orders_again (2") && provenance.contains("reflection (2"), "{provenance}");
     for grating in written.optics.gratings().expect("both") {
         assert_eq!(grating.tilt[1].rad(), about_y);
         assert!((grating.tilt[2].rad() - 8e-3).abs() < 5e-4, "{:?}", grating.tilt);

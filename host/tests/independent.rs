@@ -111,6 +111,10 @@ fn swapped_and_bad_pairs_are_refused_or_flagged() {
     let swapped = text.replacen("minus_x,minus_y,plus_x,plus_y", "plus_x,plus_y,minus_x,minus_y", 1);
     let message = decode(&swapped).unwrap_err();
     assert!(message.contains("mistaken for each other") && message.contains("20 pairs"), "{message}");
+    // one pair that happens to be right does not hide the rest
+    let good = text.lines().nth(1).expect("a pair").split(',').collect::<Vec<_>>();
+    let message = decode(&format!("{swapped}{},{},{},{}\n", good[2], good[3], good[0], good[1])).unwrap_err();
+    assert!(message.contains("mistaken for each other") && message.contains("20 pairs"), "{message}");
     // a gap and a pair that cannot be are rows with a status
     let found = decode(&format!("{text}1000,800,,\n2400,800,300,800\n")).unwrap();
     assert!(found.contains("20 of 22 pairs"), "{found}");

@@ -9,9 +9,7 @@ use daic_hil_sim::SimConfig;
 use daic_hil_sim::config::SurfaceConfig;
 use daic_hil_sim::scene::Scene;
 use daic_hil_sim::sensor::Sensor;
-use daic_optics::{
-    Brown, Camera, Decoder, Grating, OpticalModel, Optics, PixelPair, ReferenceFrame, View,
-};
+use daic_optics::{Brown, Camera, Decoder, Grating, OpticalModel, Optics, PixelPair, ReferenceFrame, View};
 use daic_rig::experiment::OpticsFile;
 use daic_rig::units::{Length, Pixels};
 use nalgebra::Vector3;
@@ -28,7 +26,8 @@ fn config() -> SimConfig {
     (config.camera.width, config.camera.height) = (SIZE[0], SIZE[1]);
     config.scene.optics.focal_px /= 2.0;
     config.scene.texture.speckle_mm = 0.25;
-    config.scene.specimen.surface = SurfaceConfig::Plane { height_mm: 0.0, slope_x: SLOPES[0], slope_y: SLOPES[1] };
+    config.scene.specimen.surface =
+        SurfaceConfig::Plane { height_mm: 0.0, slope_x: SLOPES[0], slope_y: SLOPES[1] };
     config.scene.specimen.half_width_mm = 7.0;
     config.scene.specimen.half_height_mm = 7.0;
     config
@@ -53,7 +52,14 @@ fn truth(config: &SimConfig) -> OpticalModel {
     .expect("valid")
 }
 
-fn frame(folder: &Path, name: &str, config: &SimConfig, scene: &Scene, stage_mm: [f64; 3], id: u64) -> PathBuf {
+fn frame(
+    folder: &Path,
+    name: &str,
+    config: &SimConfig,
+    scene: &Scene,
+    stage_mm: [f64; 3],
+    id: u64,
+) -> PathBuf {
     let expected: Vec<f32> = scene.render(stage_mm).into_iter().map(|e| 9000.0 * e).collect();
     let image = GreyImage {
         width: SIZE[0] as u32,

@@ -282,7 +282,9 @@ pub fn align(arguments: &AlignArgs, output: &Output) -> Result<Answer, Error> {
                     FirstGrating::Plus => View::Plus,
                 };
                 let record = arguments.record.as_deref().map(|path| (path, first));
-                align::write_optics(from, to, &camera, &step, record)?;
+                for note in align::write_optics(from, to, &camera, &step, record)? {
+                    writeln!(text, "note: {note}").ok();
+                }
                 writeln!(text, "optics: {}", to.display()).ok();
             }
             answer(arguments, &step, text)

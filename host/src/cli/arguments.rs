@@ -141,6 +141,10 @@ pub struct RunArgs {
 pub struct ProcessArgs {
     /// Dataset folder
     pub dataset: PathBuf,
+    /// Decode with this optics file, with its covariance, distortion maps and volume, instead of calibrating by the
+    /// dataset's own moves
+    #[arg(long, value_name = "FILE")]
+    pub optics: Option<PathBuf>,
     /// Measure anew what has been measured already
     #[arg(long)]
     pub fresh: bool,
@@ -371,7 +375,7 @@ pub enum DecoderArg {
 
 #[derive(Debug, Args)]
 pub struct DecodeArgs {
-    /// Optics file (examples/golden-macro.toml)
+    /// Optics file (examples/golden-macro.toml), or a microscope's (of `daic calibrate microscope`)
     #[arg(long, value_name = "FILE")]
     pub optics: PathBuf,
     /// Table (CSV) of pixel pairs: minus_x, minus_y, plus_x, plus_y and perhaps sigma_px
@@ -389,7 +393,7 @@ pub struct DecodeArgs {
 
 #[derive(Debug, Args)]
 pub struct ProfileArgs {
-    /// Optics file (examples/golden-macro.toml)
+    /// Optics file (examples/golden-macro.toml), or a microscope's (of `daic calibrate microscope`)
     #[arg(long, value_name = "FILE")]
     pub optics: PathBuf,
     /// Frame with both first-order views
@@ -400,6 +404,9 @@ pub struct ProfileArgs {
     /// Frames of a colour sensor as it recorded them: pattern and channel that is used, such as rggb:r
     #[arg(long, value_name = "PATTERN:CHANNEL")]
     pub bayer: Option<daic_rig::experiment::Bayer>,
+    /// Under a microscope: how far the matches between the views may lie from where the views' outlines coincide, pixels
+    #[arg(long, value_name = "PX", default_value_t = 40.0, value_parser = positive)]
+    pub search: f64,
     #[command(flatten)]
     pub dic: DicArgs,
     /// Distance of the nodes in object coordinates (default: as far as the points are)
@@ -412,7 +419,7 @@ pub struct ProfileArgs {
 
 #[derive(Debug, Args)]
 pub struct DisplacementArgs {
-    /// Optics file (examples/golden-macro.toml)
+    /// Optics file (examples/golden-macro.toml), or a microscope's (of `daic calibrate microscope`)
     #[arg(long, value_name = "FILE")]
     pub optics: PathBuf,
     /// Reference frame with both first-order views
@@ -425,6 +432,9 @@ pub struct DisplacementArgs {
     /// Frames of a colour sensor as it recorded them: pattern and channel that is used, such as rggb:r
     #[arg(long, value_name = "PATTERN:CHANNEL")]
     pub bayer: Option<daic_rig::experiment::Bayer>,
+    /// Under a microscope: how far the matches between the views may lie from where the views' outlines coincide, pixels
+    #[arg(long, value_name = "PX", default_value_t = 40.0, value_parser = positive)]
+    pub search: f64,
     #[command(flatten)]
     pub dic: DicArgs,
     /// Distance of the nodes in object coordinates (default: as far as the points are)

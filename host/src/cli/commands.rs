@@ -100,7 +100,8 @@ fn recording_answer(out: &Path, recorded: &processing::FrameCounts) -> Result<An
 }
 
 pub fn process(arguments: &ProcessArgs, output: &Output) -> Result<Answer, Error> {
-    let processed = processing::process(&arguments.dataset, arguments.fresh, output)?;
+    let optics = arguments.optics.as_deref().map(daic::optics_file::CalibratedOptics::load).transpose()?;
+    let processed = processing::process(&arguments.dataset, arguments.fresh, optics.as_ref(), output)?;
     let mut text = String::new();
     for note in processed.summary.damage.iter().chain(processed.summary.failed.iter().map(|f| &f.reason)) {
         writeln!(text, "note: {note}").ok();

@@ -107,13 +107,14 @@ impl Profile {
 
 fn refuse_nothing(statuses: impl Iterator<Item = PointStatus> + Clone) -> Result<(), Error> {
     let count = |status: PointStatus| statuses.clone().filter(|s| *s == status).count();
-    if count(PointStatus::Ok) > 0 {
-        return Ok(());
-    }
     let before = count(PointStatus::BeforeGrating);
     let decoded = statuses.clone().filter(|s| s.is_matched()).count();
+    // a few chance pairs may meet in front of the grating even so
     if 2 * before > decoded {
         return Err(Error::SwappedOrders { points: before });
+    }
+    if count(PointStatus::Ok) > 0 {
+        return Ok(());
     }
     Err(Error::NothingMeasured { reasons: status_counts(statuses) })
 }
@@ -140,7 +141,7 @@ impl Displacement {
 pub struct DisplacementPoint {
     /// The point before, with its own uncertainty.
     pub reference: ProfilePoint,
-    /// (u, v, w) along x, y, h in millimetres; NaN without result.
+    /// (u, v, w) along x, y, h in millimetres; NaN where it could not be computed.
     pub displacement_mm: [f64; 3],
     /// Covariance (mm²) of the displacement from the noise of match and tracking.
     pub independent_mm2: Matrix3<f64>,
@@ -225,13 +226,19 @@ fn fits(gap: &GapField, pixel_px: [f64; 2], gap_mm: f64, sigma_y_px: f64, by_y: 
 /// Decodes matched pairs; what does not fit its surroundings is marked.
 fn decode(matches: &[Match], instrument: &Instrument) -> (Vec<ProfilePoint>, GapField) {
     let mut points: Vec<ProfilePoint> = matches.par_iter().map(|m| point(instrument, m)).collect();
-    let gap = GapField::fit(&points);
+    let gap = mark_gaps(&mut points, matches);
+    (points, gap)
+}
+
+/// The gap as a smooth function of the pixel; points that depart from it are marked.
+pub(crate) fn mark_gaps(points: &mut [ProfilePoint], matches: &[Match]) -> GapField {
+    let gap = GapField::fit(points);
     for (p, m) in points.iter_mut().zip(matches).filter(|(p, _)| p.status.is_ok()) {
         if !fits(&gap, p.pixel_px, p.gap_mm, m.sigma_px[1], p.gap_by_v_mm_per_px) {
             p.status = PointStatus::Gap;
         }
     }
-    (points, gap)
+    gap
 }
 
 /// Decodes the matched views of one frame.
@@ -289,9 +296,7 @@ pub fn displacement(
             } else {
                 PointStatus::Ok
             };
-            if !status.is_ok() {
-                return without(status);
-            }
+            // the numbers stay, as those of a profile's points do: the status says what is wrong with them
             let displacement_mm = found.displacement_mm.into();
             let independent_mm2 = found.covariance_mm2;
             DisplacementPoint { reference, displacement_mm, independent_mm2, common_mm2, status }

@@ -42,7 +42,7 @@ impl GapField {
     }
 
     /// The gaps of the points that are `ok`.
-    pub(crate) fn fit(points: &[ProfilePoint]) -> Self {
+    pub(super) fn fit(points: &[ProfilePoint]) -> Self {
         let ok = || points.iter().filter(|p| p.status.is_ok());
         let gaps: Vec<f64> = ok().map(|p| p.gap_mm).collect();
         let Some(centre) = median(gaps.clone()) else { return Self::ZERO };

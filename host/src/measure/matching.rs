@@ -54,18 +54,22 @@ impl Settings {
     /// 1 + 5/4 + 5/4 = 3.5 times that of the mean over the square (the constant beside x² and y²), and shared
     /// by so many times fewer points.
     pub fn points_per_measurement(&self) -> f64 {
-        let ratio = self.dic.subset as f64 / self.step as f64;
-        let narrower = match self.dic.shape {
-            daic_correlate::Shape::Quadratic => 3.5,
-            _ => 1.0,
-        };
-        (ratio * ratio / narrower).max(1.0)
+        points_per_measurement(self.dic.subset as f64 / self.step as f64, self.dic.shape)
     }
 
     /// Over how many points along either axis neighbours share their noise.
     pub fn overlap(&self) -> f64 {
         self.points_per_measurement().sqrt()
     }
+}
+
+/// [`Settings::points_per_measurement`] for subsets `ratio` times as wide as the distance of points.
+pub fn points_per_measurement(ratio: f64, shape: daic_correlate::Shape) -> f64 {
+    let narrower = match shape {
+        daic_correlate::Shape::Quadratic => 3.5,
+        _ => 1.0,
+    };
+    (ratio * ratio / narrower).max(1.0)
 }
 
 /// Beyond the v that the optics expect, this much is searched: gratings rotated by 10 mrad.

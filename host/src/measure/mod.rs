@@ -14,6 +14,7 @@ mod object;
 mod statistics;
 mod surface;
 
+pub(crate) use decode::mark_gaps;
 pub use decode::{Displacement, DisplacementPoint, Profile, ProfilePoint, displacement, profile};
 pub use files::{
     ObjectOptions, displacement_maps, displacement_table, map_named, profile_maps, profile_table,
@@ -22,7 +23,7 @@ pub use files::{
 pub use gap::{GapField, GapSummary};
 pub use instrument::{Instrument, MapQuality};
 pub use live::Live;
-pub use matching::{Match, Rectangle, Reference, Settings, Track, Tracks, image_of};
+pub use matching::{Match, Rectangle, Reference, Settings, Track, Tracks, image_of, points_per_measurement};
 pub use object::ObjectGrid;
 pub use statistics::{Plane, Spread, plane_of, spread};
 pub use surface::{SurfaceField, SurfaceSummary, strain_status, surface_strain};

@@ -1,7 +1,8 @@
 //! Pixel pairs to points and displacements under the microscope.
 
+use super::Reach;
 use crate::measure::{
-    Displacement, DisplacementPoint, GapField, Grid, Match, PointStatus, Profile, ProfilePoint, Tracks,
+    Displacement, DisplacementPoint, Grid, Match, PointStatus, Profile, ProfilePoint, Tracks, mark_gaps,
 };
 use daic_optics::microscope::Microscope;
 use daic_optics::{Decoded, PairModel as _, PixelPair, TraceError, pixel_covariance};
@@ -14,9 +15,18 @@ pub struct Instrument {
     pub model: Microscope,
     /// Covariance of [`daic_optics::microscope::Parameters::to_array`].
     pub covariance: SMatrix<f64, 6, 6>,
+    /// What the calibration's points filled; everything if none.
+    pub reach: Option<Reach>,
 }
 
 impl Instrument {
+    /// `ok`, or `outside` where the calibration was not made.
+    fn status(&self, pair: PixelPair, height_mm: f64) -> PointStatus {
+        let middle = [0, 1].map(|i| 0.5 * (pair.minus_px[i] + pair.plus_px[i]));
+        let covered = self.reach.is_none_or(|reach| reach.covers(middle, height_mm));
+        if covered { PointStatus::Ok } else { PointStatus::Outside }
+    }
+
     fn common(&self, by: &SMatrix<f64, 3, 6>) -> Matrix3<f64> {
         by * self.covariance * by.transpose()
     }
@@ -35,7 +45,7 @@ impl Instrument {
             // the gap is the departure of y₊ − y₋ from that of the datum: no parameter enters to first order
             common_gap_mm: 0.0,
             gap_by_v_mm_per_px: decoded.gap_jacobian[3],
-            status: PointStatus::Ok,
+            status: self.status(matched.pair, decoded.point_mm.z),
         })
     }
 
@@ -62,15 +72,15 @@ impl Instrument {
             displacement_mm: found.displacement_mm.into(),
             independent_mm2: found.covariance_mm2,
             common_mm2: self.common(&by),
-            status: PointStatus::Ok,
+            status: self.status(deformed, self.model.decode_pair(deformed)?.point_mm.z),
         })
     }
 }
 
 /// Decodes the matched views of one frame, (3.4)–(3.5).
 pub fn profile(grid: &Grid, matches: &[Match], instrument: &Instrument) -> Profile {
-    let points: Vec<ProfilePoint> = matches.iter().map(|m| instrument.point(m)).collect();
-    let gap = GapField::fit(&points);
+    let mut points: Vec<ProfilePoint> = matches.iter().map(|m| instrument.point(m)).collect();
+    let gap = mark_gaps(&mut points, matches);
     Profile { grid: grid.clone(), points, states_common: true, gap }
 }
 

@@ -1,11 +1,12 @@
 //! Calibration from moves whose frames have just been tracked.
 
-use super::{Calibrated, Instrument, MicroscopeFile, field, page, run};
+use super::{Calibrated, Instrument, MicroscopeFile, Reach, field, page, run};
 use crate::error::Error;
 use crate::measure::{Match, Tracks};
 use daic_dataset::atomic;
 use daic_optics::microscope::calibrate::{FieldPoint, Motion, Settings, calibrate};
 use daic_optics::microscope::{Form, Microscope, MicroscopeError, Parameters};
+use daic_rig::experiment::Shape;
 use nalgebra::SMatrix;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write as _;
@@ -36,6 +37,8 @@ pub struct MoveSettings {
     pub subset_px: f64,
     /// Distance of points, pixels.
     pub step_px: f64,
+    /// Shape function of the subsets.
+    pub shape: Shape,
 }
 
 /// A calibrated microscope as plain numbers, with the datum of heights.
@@ -49,6 +52,8 @@ pub struct CalibratedModel {
     pub reference_disparity_px: [f64; 2],
     /// Covariance of the parameters in the order of [`Parameters::to_array`]; lengths in millimetres.
     pub covariance: [[f64; 6]; 6],
+    /// What the calibration's points filled.
+    pub reach: Option<Reach>,
 }
 
 impl CalibratedModel {
@@ -58,7 +63,7 @@ impl CalibratedModel {
     /// The first parameter that no microscope has.
     pub fn instrument(&self) -> Result<Instrument, MicroscopeError> {
         let covariance = SMatrix::from_fn(|i, j| self.covariance[i][j]);
-        Ok(Instrument { model: self.model()?, covariance })
+        Ok(Instrument { model: self.model()?, covariance, reach: self.reach })
     }
 
     /// The model.
@@ -70,8 +75,8 @@ impl CalibratedModel {
     }
 }
 
-/// Mean disparity of the matched points: where heights count from.
-fn mean_disparity(matches: &[Match]) -> [f64; 2] {
+/// Mean disparity (x₊ − x₋, y₊ − y₋) of the matched points, pixels: where heights count from.
+pub fn mean_disparity(matches: &[Match]) -> [f64; 2] {
     let ok = || matches.iter().filter(|m| m.status.is_ok());
     let count = ok().count() as f64;
     [0, 1].map(|i| ok().map(|m| m.pair.plus_px[i] - m.pair.minus_px[i]).sum::<f64>() / count)
@@ -124,10 +129,15 @@ pub fn from_moves(
     }
 
     let mut text = format!(
-        "format = \"daic-moves/1\"\nprovenance = \"the rig's own moves\"\nform = \"{}\"\ncorrelation = {{ subset = \"{} px\", step = \"{} px\" }}\n",
+        "format = \"daic-moves/1\"\nprovenance = \"the rig's own moves\"\nform = \"{}\"\ncorrelation = {{ subset = \"{} px\", step = \"{} px\", shape = \"{}\" }}\n",
         settings.form.name(),
         settings.subset_px,
-        settings.step_px
+        settings.step_px,
+        match settings.shape {
+            Shape::Translation => "translation",
+            Shape::Affine => "affine",
+            Shape::Quadratic => "quadratic",
+        }
     );
     for m in moves {
         let file = format!("{}.csv", m.name);
@@ -158,15 +168,12 @@ fn calibrated_model(
     reference_disparity_px: [f64; 2],
 ) -> Result<CalibratedModel, MicroscopeError> {
     let model = file.model(reference_disparity_px)?;
-    // of the file's micrometres, millimetres
-    let factor = [1e-3, 1e-3, 1.0, 1.0, 1.0, 1.0];
-    let covariance = file.microscope.covariance;
+    let covariance = file.instrument(reference_disparity_px)?.covariance;
     Ok(CalibratedModel {
         form: model.form(),
         parameters: *model.parameters(),
         reference_disparity_px,
-        covariance: std::array::from_fn(|i| {
-            std::array::from_fn(|j| covariance[i][j] * factor[i] * factor[j])
-        }),
+        covariance: std::array::from_fn(|i| std::array::from_fn(|j| covariance[(i, j)])),
+        reach: file.reach,
     })
 }

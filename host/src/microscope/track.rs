@@ -49,6 +49,13 @@ pub struct Tracked {
 /// # Errors
 /// An image that cannot be used, frames of different sizes, or a reference without two views.
 pub fn track(options: &TrackOptions, progress: &dyn Progress) -> Result<Vec<Tracked>, Error> {
+    let mut names = std::collections::BTreeMap::new();
+    for frame in &options.frames {
+        if let Some(first) = names.insert(field_path(&options.out, frame), frame) {
+            let (first, second) = (first.clone(), frame.clone());
+            return Err(Error::SameName { first, second, file: field_path(&options.out, frame) });
+        }
+    }
     let image = images::read(&options.reference)?;
     let reference = Reference::by_outlines(&image, options.search_px, &options.settings, progress)?;
     std::fs::create_dir_all(&options.out)

@@ -90,6 +90,7 @@ pub fn run(
     })?;
     optics.grating_to_reference_mm += axis_height_mm - height;
 
+    let covariance = covariance(&found, &model, height_sigma, shared);
     let mut parameters: Vec<CalibratedParameter> = found
         .estimates
         .iter()
@@ -104,7 +105,7 @@ pub fn run(
         name: unit_name(Parameter::GratingToReference).to_owned(),
         start: Some(start.grating_to_reference_mm),
         value: optics.grating_to_reference_mm,
-        sigma: datum_sigma(&found, &model, height_sigma) * shared.sqrt(),
+        sigma: covariance.as_ref().map_or(f64::NAN, |c| c.matrix[2][2].sqrt()),
     });
     let summary = CalibrationSummary {
         parameters,
@@ -114,7 +115,6 @@ pub fn run(
         observations: found.observations,
         rejected: found.rejected.len(),
     };
-    let covariance = covariance(&found, &model, height_sigma, shared);
     Ok(Calibrated { optics, covariance, summary: Some(summary) })
 }
 
@@ -172,14 +172,6 @@ fn height_on_axis(points: &[[f64; 3]]) -> Option<(f64, f64)> {
     let squares: f64 = points.iter().map(|p| (p[2] - row(p).dot(&coefficients)).powi(2)).sum();
     let variance = squares / (points.len() - 6) as f64;
     Some((coefficients[0], (variance * inverse[(0, 0)]).sqrt()))
-}
-
-/// How the uncertainty of F and s carries over to the height on the axis, and with it to d.
-fn datum_sigma(found: &daic_optics::calibrate::Calibration, model: &OpticalModel, height_sigma: f64) -> f64 {
-    let Some(by) = height_by(model) else { return f64::NAN };
-    let c = &found.covariance;
-    let carried = by[0] * by[0] * c[(0, 0)] + 2.0 * by[0] * by[1] * c[(0, 1)] + by[1] * by[1] * c[(1, 1)];
-    (carried.max(0.0) + height_sigma * height_sigma).sqrt()
 }
 
 /// Derivatives of the height on the axis by F and by s, at the pixels where it is seen.

@@ -73,6 +73,7 @@ impl Run<'_> {
             pixel_mm: section.pixel.mm(),
             subset_px: self.settings.dic.subset as f64,
             step_px: self.settings.step as f64,
+            shape: self.experiment.processing.shape,
         };
         let folder = self.dataset.results().join("calibration");
         let matches = &self.reference()?.matches;

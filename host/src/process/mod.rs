@@ -16,6 +16,7 @@ pub use summary::{
 use crate::error::Error;
 use crate::expand;
 use crate::measure::{self, Displacement, Instrument, ObjectOptions, Profile, Reference, spread};
+use crate::optics_file::CalibratedOptics;
 use crate::optics_section;
 use crate::progress::Progress;
 use calibration::Calibrated;
@@ -56,11 +57,17 @@ pub struct Processed {
 
 /// Measures every paired frame of the dataset in `root`.
 ///
-/// `fresh` measures anew what has been measured already.
+/// `fresh` measures anew what has been measured already. With `optics` points are decoded with these, with their covariance,
+/// maps and volume, and nothing is calibrated.
 ///
 /// # Errors
 /// A dataset without paired frames, or anything that [`crate::Error`] names.
-pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Processed, Error> {
+pub fn process(
+    root: &Path,
+    fresh: bool,
+    optics: Option<&CalibratedOptics>,
+    progress: &dyn Progress,
+) -> Result<Processed, Error> {
     let dataset = Dataset::open(root)?;
     let experiment_path = root.join("experiment.toml");
     let experiment = Experiment::parse(&dataset.experiment_toml()?, &experiment_path)?;
@@ -83,12 +90,21 @@ pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Proc
         resumed: 0,
         failed: Vec::new(),
     };
-    let (source, calibration) = match &experiment.microscope {
-        Some(_) => {
+    let (source, calibration) = match (&experiment.microscope, optics) {
+        (Some(_), Some(optics)) => {
+            return Err(Error::NotForMicroscope { optics: optics.path().to_owned(), root: root.to_owned() });
+        }
+        (None, Some(optics)) => {
+            let decoder = crate::settings::decoder(experiment.processing.decoder);
+            let source =
+                Source::Stated { key: optics.key()?, instrument: Box::new(optics.instrument(decoder)?) };
+            (source, None)
+        }
+        (Some(_), None) => {
             let (model, calibration) = run.calibrated_microscope(&paired)?;
             (Source::Microscope(model), Some(calibration))
         }
-        None => {
+        (None, None) => {
             let section = optics_section::of(&experiment)?;
             let calibrated = run.calibrated(&paired, &optics_section::from_section(section)?)?;
             write_optics(&dataset.results(), section, &calibrated)?;
@@ -200,7 +216,16 @@ fn count(records: &[FrameRecord]) -> FrameCounts {
 
 /// What makes points of pixel pairs.
 enum Source {
+    /// Optics of the experiment, perhaps calibrated by the dataset's moves.
     Macro(Calibrated),
+    /// An optics file.
+    Stated {
+        /// All of it that results depend on.
+        key: String,
+        /// Ready to decode.
+        instrument: Box<Instrument>,
+    },
+    /// A microscope, calibrated by the dataset's moves.
     Microscope(crate::microscope::CalibratedModel),
 }
 
@@ -209,6 +234,7 @@ impl Source {
     fn settings(&self) -> Result<serde_json::Value, Error> {
         let value = match self {
             Self::Macro(calibrated) => serde_json::to_value((&calibrated.optics, &calibrated.covariance)),
+            Self::Stated { key, .. } => serde_json::to_value(key),
             Self::Microscope(model) => serde_json::to_value(model),
         };
         value.map_err(|source| Error::Unwritable { path: "key".into(), reason: source.to_string() })
@@ -354,6 +380,10 @@ impl Run<'_> {
                 let reference = self.reference()?;
                 measure::profile(&reference.grid, &reference.matches, &instrument)
             }
+            Source::Stated { instrument, .. } => {
+                let reference = self.reference()?;
+                measure::profile(&reference.grid, &reference.matches, instrument)
+            }
             Source::Microscope(model) => {
                 let reference = self.reference()?;
                 crate::microscope::profile(&reference.grid, &reference.matches, &model.instrument()?)
@@ -395,6 +425,10 @@ impl Run<'_> {
                 let instrument = self.instrument(calibrated)?;
                 let Reference { grid, matches, .. } = self.reference()?;
                 measure::displacement(grid, matches, &tracks, &instrument, settings.height_mm)
+            }
+            Source::Stated { instrument, .. } => {
+                let Reference { grid, matches, .. } = self.reference()?;
+                measure::displacement(grid, matches, &tracks, instrument, settings.height_mm)
             }
             Source::Microscope(model) => {
                 let Reference { grid, matches, .. } = self.reference()?;
@@ -502,7 +536,7 @@ fn write_optics(
     let file = OpticsFile {
         format: Some(OpticsFile::FORMAT.to_owned()),
         provenance: Some(provenance),
-        date: None,
+        date: Some(crate::camera_file::now()),
         covariance: calibrated.covariance.clone(),
         maps: None,
         volume: None,

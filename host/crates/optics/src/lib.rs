@@ -70,7 +70,8 @@ pub use maps::{DistortionMap, DistortionMaps, MapError, MapFit, MapGrid, MapSamp
 pub use model::{OpticalModel, Ray, TraceError};
 pub use pair_model::PairModel;
 pub use parameter::{
-    CovarianceError, GratingParameter, Parameter, ParameterCovariance, ParameterJacobian, UnknownParameter,
+    CovarianceError, GratingParameter, LEAST_EIGENVALUE, Parameter, ParameterCovariance, ParameterJacobian,
+    UnknownParameter, least_correlation_eigenvalue,
 };
 pub use patch::{GreyError, GreyView};
 pub use project::DisparityRange;

@@ -1,6 +1,6 @@
 //! The quantities of a set-up that can be estimated or carry an uncertainty.
 
-use nalgebra::{DMatrix, SMatrix, SVector};
+use nalgebra::{DMatrix, SMatrix, SVector, SymmetricEigen};
 use serde::{Deserialize, Serialize};
 
 use crate::setup::{Optics, View};
@@ -345,7 +345,35 @@ pub enum CovarianceError {
         /// The value.
         value: f64,
     },
+    /// Every pair fits, all together do not: some combination of the parameters would have a negative variance.
+    #[error(
+        "the covariance is of no possible errors: the smallest eigenvalue of its correlations is {eigenvalue}, it must not be below 0"
+    )]
+    Negative {
+        /// Smallest eigenvalue of the matrix of correlations.
+        eigenvalue: f64,
+    },
 }
+
+/// Smallest eigenvalue of the correlations of a symmetric matrix with a diagonal that is not below 0; 0 for a matrix
+/// without entries. A covariance has none below 0 but for rounding ([`LEAST_EIGENVALUE`]).
+pub fn least_correlation_eigenvalue(covariance: &DMatrix<f64>) -> f64 {
+    let n = covariance.nrows();
+    let correlation = DMatrix::from_fn(n, n, |i, j| {
+        let unit = (covariance[(i, i)] * covariance[(j, j)]).sqrt();
+        if i == j {
+            1.0
+        } else if unit > 0.0 {
+            covariance[(i, j)] / unit
+        } else {
+            0.0
+        }
+    });
+    if n == 0 { 0.0 } else { SymmetricEigen::new(correlation).eigenvalues.min() }
+}
+
+/// As far below 0 as rounding may bring the smallest eigenvalue of correlations written with 17 digits.
+pub const LEAST_EIGENVALUE: f64 = -1e-9;
 
 impl ParameterCovariance {
     /// Nothing uncertain.
@@ -377,6 +405,10 @@ impl ParameterCovariance {
                     return Err(CovarianceError::Entry { row: parameters[i], column: parameters[j], value });
                 }
             }
+        }
+        let eigenvalue = least_correlation_eigenvalue(&matrix);
+        if eigenvalue < LEAST_EIGENVALUE {
+            return Err(CovarianceError::Negative { eigenvalue });
         }
         Ok(Self { parameters, matrix })
     }
