@@ -236,7 +236,7 @@ Left out are points less than {TIP_PX:.0} px from the cone's tip and {CONFINED_P
     text += &format!(
         "
 Decoded by exact rays, calibrated from a printed plate at five heights, starting 1 % off in F and s and 1 mm off in d. An affine shape function cannot follow the
-cylinder over {SUBSET} px: that is its 2 µm.
+cylinder over {SUBSET} px: it takes w²/24·u'' for displacement, the same all over but for the perspective, so that most of it goes with the registration.
 
 ### What the model, the map and the correlation contribute
 
