@@ -263,7 +263,8 @@ The same through a lens that distorts by 0.1 % in the corner of the sensor; `lin
     text += &edges(bench);
     text += "
 With its edge along x both views see both levels up to the edge. With its edge along y the −1 view sees the wall and a strip of the lower level that the upper one hides
-from the +1 view; distances count from that zone. A point on a step is solved with its own side of the subset, or refused.
+from the +1 view; distances count from that zone. A point on a step is solved with its own side of the subset, or refused; one whose whole subset
+stays below a ZNCC of 0.9 is refused too (undisturbed: 0.997).
 
 ### Calibration
 

@@ -17,7 +17,7 @@ const LEVEL_PX: f64 = 0.5;
 /// A Gaussian is cut off at this many standard deviations.
 const REACH: f64 = 4.0;
 /// Points at which the blur is looked for, in each view.
-const PROBES: usize = 200;
+const PROBES: usize = 64;
 
 /// References of one frame with rising blur.
 pub struct Bank {
