@@ -97,6 +97,14 @@ pub enum Error {
         /// What it says.
         meaning: &'static str,
     },
+    /// A folder in which no image appeared.
+    #[error("{}: no new image came within {seconds} s; let the camera's program write into this folder", folder.display())]
+    NoImageCame {
+        /// The folder.
+        folder: PathBuf,
+        /// How long it was watched.
+        seconds: f64,
+    },
     /// A record of the alignment that cannot be read.
     #[error("{} is no record of an alignment: {reason}", path.display())]
     AlignRecord {

@@ -64,6 +64,9 @@ fn an_independent_script_finds_the_same_points() {
                 "pairs.csv",
                 "--decoder",
                 decoder,
+                // the noise that `pairs` adds
+                "--sigma",
+                "1.2",
                 "--out",
                 "points.csv",
             ];
@@ -92,7 +95,17 @@ fn swapped_and_bad_pairs_are_refused_or_flagged() {
     let text = pairs(&optics, &mut Normal::new(21), 20);
     let decode = |text: &str| {
         std::fs::write(folder.path().join("pairs.csv"), text).unwrap();
-        let arguments = ["decode", "--quiet", "--optics", "optics.toml", "pairs.csv", "--out", "points.csv"];
+        let arguments = [
+            "decode",
+            "--quiet",
+            "--optics",
+            "optics.toml",
+            "pairs.csv",
+            "--sigma",
+            "1.2",
+            "--out",
+            "points.csv",
+        ];
         run(env!("CARGO_BIN_EXE_daic"), &arguments, folder.path())
     };
     let swapped = text.replacen("minus_x,minus_y,plus_x,plus_y", "plus_x,plus_y,minus_x,minus_y", 1);

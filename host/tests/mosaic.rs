@@ -71,9 +71,9 @@ fn a_channel_measures_where_its_pixels_are() {
     let moved_mm = [0.08, -0.05, 0.3];
     let (before, after) = (frame(&config, &scene, [0.0; 3], 0), frame(&config, &scene, moved_mm, 1));
     // Pattern GRBG: red at (1, 0), green of the red rows at (0, 0).
-    for (name, origin, limit_um) in [("red", [1, 0], 2.0), ("green", [0, 0], 4.0)] {
+    for (name, origin) in [("red", [1, 0]), ("green", [0, 0])] {
         let mut settings = Settings { lattice: Lattice::bayer(origin), step: 8, ..Settings::default() };
-        (settings.dic.subset, settings.dic.shape) = (41, daic_correlate::Shape::Affine);
+        (settings.dic.subset, settings.dic.shape) = (41, daic_correlate::Shape::Quadratic);
         let reference = Reference::new(&before, &model, &settings, &Silent).expect("two views");
         assert_eq!(
             (reference.grid.step, reference.grid.x0 % 2, reference.grid.y0 % 2),
@@ -102,8 +102,17 @@ fn a_channel_measures_where_its_pixels_are() {
         }
         let rms = squares.map(|s| s.map(|s| 1e3 * (s / ok.len() as f64).sqrt()));
         eprintln!("{name}: points {:.3?} µm, displacement {:.3?} µm RMS over {}", rms[0], rms[1], ok.len());
-        for (i, &value) in rms.iter().flatten().enumerate() {
-            assert!(value < limit_um, "{name}, {i}: {value} µm");
+        let mut sigma = [[0.0; 3]; 2];
+        for p in &ok {
+            for (sum, stated) in sigma.iter_mut().zip([p.reference.sigma_mm(), p.sigma_mm()]) {
+                *sum = [0, 1, 2].map(|i| sum[i] + stated[i].powi(2));
+            }
+        }
+        let sigma = sigma.map(|s| s.map(|s| 1e3 * (s / ok.len() as f64).sqrt()));
+        eprintln!("{name}: stated {:.3?} µm, displacement {:.3?} µm", sigma[0], sigma[1]);
+        for (found, stated) in rms.iter().flatten().zip(sigma.iter().flatten()) {
+            // subsets overlap: 169 points are worth about 7, whose RMS scatters by 27 %; two of that
+            assert!(found / stated < 1.55, "{name}: {found} µm, stated {stated}");
         }
     }
 }

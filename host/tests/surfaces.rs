@@ -86,9 +86,10 @@ fn the_gap_reveals_a_wrong_calibration() {
     assert!((within - 0.683).abs() < 0.045, "{within}");
 
     type Change = Box<dyn Fn(&mut Optics)>;
-    let wrong: [(&str, Change); 5] = [
+    let wrong: [(&str, Change); 6] = [
         ("grooves of one grating 0.05 mrad off", Box::new(|o| o.plus.tilt_rad_xyz[2] += 5e-5)),
         ("pitch of one grating 0.1 % off", Box::new(|o| o.plus.pitch_mm *= 1.001)),
+        ("pitch of one grating 1 % off", Box::new(|o| o.plus.pitch_mm *= 1.01)),
         (
             "pitch of both 1 % off",
             Box::new(|o| {
@@ -104,8 +105,10 @@ fn the_gap_reveals_a_wrong_calibration() {
         change(&mut o);
         let (found, surface) = gap(&o, &grid, &found);
         println!("{name}: {found:?}");
-        assert!(!found.consistent, "{name}: {found:?}");
-        assert!(found.verdict().contains("do not meet"));
+        // a pitch moves the rays along x, the gap lies along y: 0.1 % does not show
+        let shows = !name.contains("0.1 %");
+        assert_eq!(found.consistent, !shows, "{name}: {found:?}");
+        assert_eq!(found.verdict().contains("do not meet"), shows);
         // the points remain: it is for the user to judge
         assert!(surface.points.iter().all(|p| p.status.is_ok()));
     }
@@ -158,31 +161,42 @@ fn a_rigid_tilt_has_no_strain() {
     let motion = |p: Vector3<f64>| turn * p + Vector3::new(0.1, 0.05, 0.2);
     let settings = Settings { window: 9, overlap: 0.0, ..Settings::default() };
     type Height = fn(f64, f64) -> f64;
-    let surfaces: [(&str, Height); 2] =
-        [("plane", |_, _| 0.0), ("cylinder", |x, _| cylinder(x))];
+    let surfaces: [(&str, Height); 2] = [("plane", |_, _| 0.0), ("cylinder", |x, _| cylinder(x))];
     for (name, h) in surfaces {
         let exact = surface_strain(&moved(&truth, &h, &motion, 0.0, 7), &settings, 59).unwrap();
         let worst =
             exact.strains.iter().flatten().flat_map(|s| s.strain).fold(0.0, |a: f64, b| a.max(b.abs()));
         // 1e-12 mm of decoding over a window of 2 mm
         assert!(worst < 1e-11, "{name} {worst:e}");
-        let found = surface_strain(&moved(&truth, &h, &motion, SIGMA_PX, 8), &settings, 59).unwrap();
-        let summary = found.summary();
         let (mut within, mut of, mut square) = (0.0, 0.0, 0.0);
-        for s in found.strains.iter().flatten() {
-            for (e, sigma) in s.strain.iter().zip(s.sigma()) {
-                within += f64::from(u8::from(e.abs() <= sigma));
-                square += (e / sigma).powi(2);
-                of += 1.0;
+        let mut means = [0.0; 3];
+        let mut sigma = [0.0; 3];
+        let runs = 10;
+        for seed in 0..runs {
+            let field = moved(&truth, &h, &motion, SIGMA_PX, 80 + seed);
+            let found = surface_strain(&field, &settings, 59).unwrap();
+            let summary = found.summary();
+            // nodes with at least 0.6 of a window of 9 × 9 among 35 × 30
+            assert_eq!(summary.ok, 904, "{summary:?}");
+            for s in found.strains.iter().flatten() {
+                for (e, sigma) in s.strain.iter().zip(s.sigma()) {
+                    within += f64::from(u8::from(e.abs() <= sigma));
+                    square += (e / sigma).powi(2);
+                    of += 1.0;
+                }
             }
+            for (mean, of_run) in means.iter_mut().zip(summary.mean) {
+                *mean += of_run / runs as f64;
+            }
+            sigma = summary.sigma;
         }
         let (within, ratio) = (within / of, f64::sqrt(square / of));
-        println!("{name}: {:.1} % within σ, scatter/σ {ratio:.3}; {summary:?}", 100.0 * within);
-        assert!(summary.ok > 1000, "{summary:?}");
-        // windows of 9 × 9 among 35 × 30 points: about 40 independent strains of three components
-        assert!((within - 0.683).abs() < 0.08 && (ratio - 1.0).abs() < 0.13, "{within} {ratio}");
+        println!("{name}: {:.1} % within σ, scatter/σ {ratio:.3}; means {means:?}", 100.0 * within);
+        // 35 × 30 points hold 13 windows of 9 × 9: ten runs have 390 independent strains, an RMS of them scatters by
+        // 3.6 %, a share by 2.4 %; two of that
+        assert!((within - 0.683).abs() < 0.048 && (ratio - 1.0).abs() < 0.072, "{within} {ratio}");
         for c in 0..3 {
-            assert!(summary.mean[c].abs() < 3.0 * summary.sigma[c] / 40f64.sqrt(), "{summary:?}");
+            assert!(means[c].abs() < 3.0 * sigma[c] / 130f64.sqrt(), "{means:?}");
         }
     }
 }
@@ -212,8 +226,8 @@ fn a_stretched_cylinder_has_the_true_strain() {
         worst = worst.max((s.principal[0] - e[1]).abs()).max((s.principal[1] - e[0]).abs());
     }
     println!("worst {worst:.2e}, {:?}", found.summary());
-    // smoothing of the tangents over a window of 5 points 0.5 mm apart, (1 mm/36 mm)² of a strain of 4e-3
-    assert!(worst < 5e-6, "{worst:e}");
+    // 4.5e-7: smoothing of the tangents over a window of 5 points 0.5 mm apart, below (1 mm/36 mm)² of a strain of 4e-3
+    assert!(worst < 6e-7, "{worst:e}");
 }
 
 /// Resampled heights are those of the surface to the sag of its chords; σ is carried, nothing lies outside.

@@ -68,6 +68,7 @@ fn outcome_of(mut command: Command) -> Outcome {
 pub fn test() -> Report {
     let mut report = Report::default();
     report.step("tests of the workspace", || outcome_of(cargo(&["test", "--workspace", "--locked"])));
+    report.step("the tour of the examples", tour);
     report.step("firmware for thumbv6m-none-eabi", thumb);
     report.step("instruction counts of the correlation (callgrind)", || crate::bench::guard::guard(false));
     report.step("data of others", || {
@@ -82,6 +83,21 @@ pub fn test() -> Report {
         }
     });
     report
+}
+
+/// Every command that calibrates, aligns, decodes or plans, on simulated inputs.
+fn tour() -> Outcome {
+    let build = ["build", "--locked", "--package", "daic", "--bin", "daic", "--example", "rehearsal"];
+    match outcome_of(cargo(&build)) {
+        Outcome::Passed => {}
+        other => return other,
+    }
+    let target = std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root().join("target"), PathBuf::from);
+    let built = target.join("debug");
+    let mut command = Command::new("bash");
+    command.arg(root().join("examples/tour.sh")).arg(target.join("tour"));
+    command.env("DAIC", built.join("daic")).env("REHEARSAL", built.join("examples/rehearsal"));
+    outcome_of(command)
 }
 
 /// Builds protocol and firmware for the Pico's core, with a toolchain brought into `target/thumb`

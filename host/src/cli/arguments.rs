@@ -459,6 +459,10 @@ pub struct TrackArgs {
     pub bayer: Option<daic_rig::experiment::Bayer>,
     #[command(flatten)]
     pub dic: DicArgs,
+    /// Also write the table (CSV) that `daic calibrate rig` takes: the frames show a flat speckled plate, pose 0 is the
+    /// reference, pose 1 the first frame
+    #[arg(long, value_name = "FILE")]
+    pub plate: Option<PathBuf>,
     /// Folder for the fields, a CSV file per frame
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,

@@ -67,7 +67,7 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Track(arguments) => surface::track(arguments, output),
         Command::Calibrate(arguments) => calibrate::calibrate(arguments, output),
         Command::Plan(arguments) => plan::plan(arguments),
-        Command::Align(arguments) => align::align(arguments),
+        Command::Align(arguments) => align::align(arguments, output),
         Command::Init(arguments) => commands::init(arguments),
         Command::Schema => commands::schema(),
         Command::Doctor(arguments) => commands::doctor(arguments),

@@ -147,6 +147,7 @@ pub fn track(arguments: &TrackArgs, output: &Output) -> Result<Answer, Error> {
         search_px: arguments.search,
         settings,
         out: arguments.out.clone(),
+        plate: arguments.plate.clone(),
     };
     let found = daic::microscope::track(&options, output)?;
     let mut text = String::new();
@@ -155,7 +156,15 @@ pub fn track(arguments: &TrackArgs, output: &Output) -> Result<Answer, Error> {
         let (frame, ok, points, field) = (&t.frame, t.ok, t.points, &t.field);
         writeln!(text, "{frame}: {ok} of {points} points, −1 view ({a:.3}, {b:.3}) px, +1 view ({c:.3}, {d:.3}) px (mean) -> {field}").ok();
     }
-    text.push_str("next: name the fields in a file of moves for daic calibrate microscope");
+    match &arguments.plate {
+        Some(plate) => write!(
+            text,
+            "next: daic calibrate rig {} --moves FILE with the stage's moves, for the scale",
+            plate.display()
+        )
+        .ok(),
+        None => write!(text, "next: name the fields in a file of moves for daic calibrate microscope").ok(),
+    };
     let all = found.iter().all(|t| t.ok > 0);
     Ok(Answer::new(json!({ "frames": as_json(&found)? }), text).checked(all))
 }
