@@ -38,9 +38,9 @@ fn chapter_3_on_a_small_field() {
     let (translation, tilt, ball) = THESIS;
     for (number, thesis) in [translation, tilt].into_iter().enumerate() {
         let ours = results.motion(number, Shape::Quadratic, Way::Perspective).expect("a motion");
-        for i in 0..3 {
+        for (error, limit) in ours.rms_um.into_iter().zip(thesis) {
             // "each at least 5× smaller"
-            assert!(5.0 * ours.rms_um[i] <= thesis[i], "{}: {:?} µm", ours.name, ours.rms_um);
+            assert!(5.0 * error <= limit, "{}: {:?} µm", ours.name, ours.rms_um);
         }
     }
     let measured = results.ball(Shape::Quadratic).expect("the ball");

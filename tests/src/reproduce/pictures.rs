@@ -68,12 +68,13 @@ impl Field<'_> {
         Ok(heatmap.render_svg()?)
     }
 
-    /// Points within half a node of the line where coordinate `across` is `at`, along the other one.
+    /// Points within a third of a node of the line where coordinate `across` is `at`, along the other one:
+    /// a single row of a grid whose step is two thirds of a node.
     pub fn section(&self, across: usize, at: f64) -> Vec<(f64, f64)> {
         let mut line: Vec<(f64, f64)> = self
             .points
             .iter()
-            .filter(|p| (p[across] - at).abs() <= 0.5 * self.pitch)
+            .filter(|p| (p[across] - at).abs() <= self.pitch / 3.0)
             .map(|p| (p[1 - across], p[2]))
             .collect();
         line.sort_by(|a, b| a.0.total_cmp(&b.0));

@@ -13,6 +13,46 @@ pub fn largest(values: impl IntoIterator<Item = f64>) -> f64 {
     values.into_iter().fold(0.0, |m, v| m.max(v.abs()))
 }
 
+/// A quadratic in x and y.
+#[derive(Clone, Copy, Debug)]
+pub struct Quadratic {
+    centre: [f64; 2],
+    scale: f64,
+    terms: Vector6<f64>,
+}
+
+impl Quadratic {
+    /// How many coefficients it has.
+    pub const TERMS: usize = 6;
+
+    /// Least squares; none if the places do not determine it.
+    pub fn fit(at: &[[f64; 2]], values: &[f64]) -> Option<Self> {
+        let n = at.len() as f64;
+        let centre = [0, 1].map(|i| at.iter().map(|p| p[i]).sum::<f64>() / n);
+        let scale = rms(at.iter().map(|p| (p[0] - centre[0]).hypot(p[1] - centre[1])));
+        let mut found = Self { centre, scale, terms: Vector6::zeros() };
+        let mut normal = Matrix6::zeros();
+        let mut right = Vector6::zeros();
+        for (p, value) in at.iter().zip(values) {
+            let by = found.basis(*p);
+            normal += by * by.transpose();
+            right += by * *value;
+        }
+        found.terms = normal.cholesky()?.solve(&right);
+        found.terms.iter().all(|t| t.is_finite()).then_some(found)
+    }
+
+    fn basis(&self, at: [f64; 2]) -> Vector6<f64> {
+        let [x, y] = [0, 1].map(|i| (at[i] - self.centre[i]) / self.scale);
+        Vector6::new(1.0, x, y, x * x, x * y, y * y)
+    }
+
+    /// Its value.
+    pub fn at(&self, at: [f64; 2]) -> f64 {
+        self.basis(at).dot(&self.terms)
+    }
+}
+
 /// Steps of the registration: quadratic convergence from a few tenths of the field.
 const STEPS: usize = 8;
 /// Motions that change the heights this much less than others (as a square) are left alone: a cylinder

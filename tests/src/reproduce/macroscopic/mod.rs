@@ -191,7 +191,7 @@ fn case(
     shape: Shape,
 ) -> Result<Case, ReproduceError> {
     let found = matched(rig, shot, shape)?;
-    let smooth = |px, point| specimen.is_smooth(truth, px, point).unwrap_or(false);
+    let smooth = |px, point| specimen.is_smooth(truth, px, point);
     let pairs: Vec<PixelPair> = found.points.iter().map(|m| m.pair).collect();
     let exact_pairs: Vec<PixelPair> = found
         .points
@@ -204,11 +204,15 @@ fn case(
         measured.push(decode(way, &shot.scene, &pairs, &smooth)?);
         exact.push(decode(way, &shot.scene, &exact_pairs, &smooth)?);
     }
-    let correlation_px = rms(found.points.iter().filter_map(|m| {
-        let p = truth.decode_point(Decoder::Ray, m.pair).ok()?;
-        let away = smooth(m.pair.minus_px, p.into());
-        m.exact_plus_px.filter(|_| away).map(|q| m.pair.plus_px[0] - q[0])
-    }));
+    let mut disparity_errors = Vec::new();
+    for m in &found.points {
+        let Some(q) = m.exact_plus_px else { continue };
+        let p = truth.decode_point(Decoder::Ray, PixelPair { minus_px: m.pair.minus_px, plus_px: q })?;
+        if smooth(m.pair.minus_px, p.into())? {
+            disparity_errors.push(m.pair.plus_px[0] - q[0]);
+        }
+    }
+    let correlation_px = rms(disparity_errors);
     let mut spread = Vec::new();
     for p in measured[4].points.iter().filter(|p| 1e3 * p.registered_mm.abs() > LARGE_UM) {
         spread.push(specimen.edge_distance_px(truth, p.minus_px, p.point_mm)?);

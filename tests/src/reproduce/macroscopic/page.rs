@@ -236,7 +236,7 @@ Left out are points less than {TIP_PX:.0} px from the cone's tip and {CONFINED_P
     text += &format!(
         "
 Decoded by exact rays, calibrated from a printed plate at five heights, starting 1 % off in F and s and 1 mm off in d. An affine shape function cannot follow the
-cylinder over {SUBSET} px: that is its 2 µm.
+cylinder over {SUBSET} px: it takes w²/24·u'' for displacement, the same all over but for the perspective, so that most of it goes with the registration.
 
 ### What the model, the map and the correlation contribute
 
@@ -263,7 +263,8 @@ The same through a lens that distorts by 0.1 % in the corner of the sensor; `lin
     text += &edges(bench);
     text += "
 With its edge along x both views see both levels up to the edge. With its edge along y the −1 view sees the wall and a strip of the lower level that the upper one hides
-from the +1 view; distances count from that zone. A point on a step is solved with its own side of the subset, or refused.
+from the +1 view; distances count from that zone. A point on a step is solved with its own side of the subset, or refused; one whose whole subset
+stays below a ZNCC of 0.9 is refused too (undisturbed: 0.997).
 
 ### Calibration
 

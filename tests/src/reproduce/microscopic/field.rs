@@ -1,6 +1,7 @@
 //! From frames of the microscope to matched and tracked points.
 
 use super::super::{ReproduceError, SUBSET};
+use super::focus::Bank;
 use super::scene::Scene;
 use daic_correlate::{
     Guess, Image, Point, Points, Rectangle, Reference, Roi, Settings, Shape, Target, correlate,
@@ -21,11 +22,13 @@ pub struct Tracked {
 
 /// A reference frame with its matched views.
 pub struct Matched {
-    reference: Reference,
+    bank: Bank,
     settings: Settings,
     minus: Points,
     /// What was matched; an entry for every point of the grid.
     pub pairs: Vec<Option<PixelPair>>,
+    /// σ of their disparity along x, px.
+    pub sigma_px: Vec<Option<f64>>,
 }
 
 fn seen(p: &Point) -> Option<([f64; 2], [f64; 2])> {
@@ -70,8 +73,8 @@ impl Matched {
         let (u0, u1) = over(&|c| c.plus_px[0] - c.minus_px[0]);
         let guess = Guess::Search { u: (u0 - 5.0, u1 + 5.0), v: (-5.0, 5.0) };
         let target = Target::new(frame.clone(), settings.interpolation);
-        let reference = Reference::new(frame);
-        let found = correlate(&reference, &target, &minus, &guess, &settings, &())?;
+        let bank = Bank::new(&frame)?;
+        let found = correlate(bank.sharp(), &target, &minus, &guess, &settings, &())?;
         let pairs = found
             .points
             .iter()
@@ -80,21 +83,36 @@ impl Matched {
                 Some(PixelPair { minus_px: [p.x, p.y], plus_px })
             })
             .collect();
-        Ok(Self { reference, settings, minus, pairs })
+        let sigma_px = found.points.iter().map(|p| seen(p).map(|(_, sigma)| sigma[0])).collect();
+        Ok(Self { bank, settings, minus, pairs, sigma_px })
     }
 
-    /// Follows the pairs into `frame`; the +1 points are correlated where they are, between pixels.
+    /// Follows the pairs into `frame`, first with the reference as it is, then with the reference in the
+    /// frame's focus; the +1 points are correlated where they are, between pixels.
     ///
     /// # Errors
     /// What the correlation refuses.
     pub fn track(&self, frame: Image) -> Result<Vec<Tracked>, ReproduceError> {
         let target = Target::new(frame, self.settings.interpolation);
-        let run =
-            |points: &Points| correlate(&self.reference, &target, points, &Guess::Auto, &self.settings, &());
-        let left = run(&self.minus)?;
         let known: Vec<usize> = (0..self.pairs.len()).filter(|k| self.pairs[*k].is_some()).collect();
         let places = known.iter().filter_map(|k| self.pairs[*k]).map(|p| p.plus_px).collect();
-        let right = run(&Points::scattered(places)?)?;
+        let plus = Points::scattered(places)?;
+        let run = |reference: &Reference, points: &Points, guess: &Guess<'_>| {
+            correlate(reference, &target, points, guess, &self.settings, &())
+        };
+        let first = [&self.minus, &plus].map(|points| run(self.bank.sharp(), points, &Guess::Auto));
+        let [left, right] = first;
+        let (left, right) = (left?, right?);
+        let moves = |found: &[Point]| -> Vec<Option<[f64; 2]>> {
+            found.iter().map(|p| p.status.is_ok().then_some([p.u, p.v])).collect()
+        };
+        let probes = |found: &[Point]| -> Vec<([f64; 2], [f64; 2])> {
+            found.iter().filter(|p| p.status.is_ok()).map(|p| ([p.x, p.y], [p.u, p.v])).collect()
+        };
+        let (a, b) = (probes(&left.points), probes(&right.points));
+        let focused = self.bank.focused(&target, [&a, &b], &self.settings)?;
+        let left = run(&focused, &self.minus, &Guess::Given(&moves(&left.points)))?;
+        let right = run(&focused, &plus, &Guess::Given(&moves(&right.points)))?;
         let tracked = known.iter().zip(&right.points).filter_map(|(k, right)| {
             let before = self.pairs[*k]?;
             let (minus_px, a) = seen(&left.points[*k])?;

@@ -1,6 +1,7 @@
 //! Chapter 3: the microscope. Rigid motions and a steel ball, simulated and measured.
 
 mod field;
+mod focus;
 mod page;
 mod profile;
 mod rigid;
@@ -32,10 +33,16 @@ pub struct Results {
     pub balls: Vec<Ball>,
     /// What the calibration found, and what the geometry has.
     pub parameters: [Parameters; 2],
+    /// Size of a pixel along y in that along x, as found and as the geometry has it.
+    pub aspect: [f64; 2],
     /// Its σ.
     pub sigma: [f64; 6],
-    /// Its RMS residual, px, and the calibration's moves.
+    /// Its RMS residual, px.
     pub residual_px: f64,
+    /// Points of the calibration left out as outliers.
+    pub rejected: usize,
+    /// Its χ² over degrees of freedom.
+    pub chi_square: f64,
     /// The moves that the calibration saw.
     pub moves: Vec<&'static str>,
     /// Data of the figures.
@@ -66,20 +73,26 @@ pub fn run(extent: Extent) -> Result<Results, ReproduceError> {
         balls.push(ball.measure(shape, &measured, &linear, &perspective)?);
         if shape == Shape::Quadratic {
             drawn = measured.drawn(&perspective)?;
-            found = Some((perspective, measured.moves()));
+            found = Some((perspective, measured.moves(), measured.aspect));
         }
     }
-    let (calibration, moves) = found.ok_or(ReproduceError::Open)?;
+    let (calibration, moves, aspect) = found.ok_or(ReproduceError::Open)?;
     drawn.views = vec![plate.picture(), ball.picture()];
-    let parameters = calibration.parameters.ok_or(ReproduceError::Open)?;
+    let mut parameters = calibration.parameters.ok_or(ReproduceError::Open)?;
+    parameters.centre_px[1] /= aspect;
     let covariance = calibration.covariance.ok_or(ReproduceError::Open)?;
+    let mut sigma = std::array::from_fn(|i| covariance[(i, i)].sqrt());
+    sigma[5] /= aspect;
     Ok(Results {
         step: extent.step(),
         half_mm,
         motions,
         balls,
         parameters: [parameters, plate.truth()?],
-        sigma: std::array::from_fn(|i| covariance[(i, i)].sqrt()),
+        aspect: [aspect, plate.true_aspect()?],
+        sigma,
+        rejected: calibration.rejected.len(),
+        chi_square: calibration.chi_square_reduced,
         residual_px: calibration.rms_px,
         moves,
         figures: drawn,

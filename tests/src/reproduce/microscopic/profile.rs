@@ -5,7 +5,7 @@ use super::super::statistics::{Registration, rms};
 use super::SEED;
 use super::field::Matched;
 use super::page::Picture;
-use super::rigid::Measured;
+use super::rigid::{Measured, square};
 use super::scene::Scene;
 use daic_correlate::{Image, Shape};
 use daic_optics::PairModel;
@@ -48,6 +48,8 @@ pub struct Ball {
     pub rms_um: [f64; 3],
     /// The thesis' way: heights at the −1 coordinate, β₂ alone; registered.
     pub at_minus_um: f64,
+    /// What photon and read noise alone make of h by the correlation's σ, µm (RMS).
+    pub noise_um: f64,
     /// Errors over the distance from the top (perspective).
     pub rings: Vec<Ring>,
     /// (x, y, h, error) of every point, µm (perspective, registered).
@@ -102,18 +104,20 @@ impl Specimen {
             };
             inside.iter().map(error).collect::<Vec<_>>()
         };
-        let decode = |model: &dyn PairModel| -> Result<Vec<[f64; 4]>, ReproduceError> {
-            let points = pairs.iter().map(|p| Ok(model.decode_pair(*p)?.point_mm.into()));
+        let decode = |model: &dyn PairModel, aspect: f64| -> Result<Vec<[f64; 4]>, ReproduceError> {
+            let points = pairs.iter().map(|p| Ok(model.decode_pair(square(*p, aspect))?.point_mm.into()));
             Ok(registered(points.collect::<Result<_, ReproduceError>>()?))
         };
         let (l, p) = (plate.model(linear)?, plate.model(perspective)?);
-        let all = [decode(&l)?, decode(&p)?, decode(&self.scene.microscope)?];
+        let aspect = plate.aspect;
+        let all = [decode(&l, aspect)?, decode(&p, aspect)?, decode(&self.scene.microscope, 1.0)?];
         let of = |points: &[[f64; 4]]| 1e3 * rms(points.iter().map(|p| p[3]));
         let beta = l.parameters();
         let centre = super::field::centre(&self.scene, daic_optics::View::Minus)?;
         let at_minus = pairs.iter().map(|p| {
             let h = -0.5 * beta.beta1_mm_per_px * (p.plus_px[0] - p.minus_px[0] - plate.disparity_px[0]);
             let [x, y] = [0, 1].map(|i| beta.beta2_mm_per_px * (p.minus_px[i] - centre[i]));
+            let y = y * aspect;
             [x, y, h]
         });
         let at_minus_um = of(&registered(at_minus.collect()));
@@ -136,6 +140,7 @@ impl Specimen {
             points: best.len(),
             rms_um: [of(&all[0]), of(best), of(&all[2])],
             at_minus_um,
+            noise_um: 1e3 * 0.5 * beta.beta1_mm_per_px * rms(matched.sigma_px.iter().flatten().copied()),
             rings,
             surface_um: best.iter().map(|p| p.map(|v| 1e3 * v)).collect(),
         })

@@ -7,10 +7,10 @@ use super::field::{Matched, Tracked};
 use super::page::{Drawn, Picture};
 use super::scene::Scene;
 use daic_correlate::{Image, Shape};
-use daic_optics::PairModel;
 use daic_optics::microscope::calibrate::{Calibration, FieldPoint, Motion, Settings, calibrate};
 use daic_optics::microscope::{Form, Microscope, Parameters};
-use nalgebra::{Matrix4, Rotation3, Vector3};
+use daic_optics::{PairModel, PixelPair, View};
+use nalgebra::{Matrix4, Rotation3, Vector3, Vector4};
 
 /// A rigid motion about the middle of the field.
 struct Move {
@@ -48,10 +48,6 @@ impl Move {
     }
 }
 
-/// Standard deviation of what the six parameters cannot follow, px: added to the images' noise, so that
-/// no point counts as an outlier for it.
-const MODEL_PX: f64 = 0.02;
-
 /// How displacements were decoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Way {
@@ -78,6 +74,8 @@ pub struct MotionErrors {
     pub points: usize,
     /// RMS of decoded minus imposed (u, v, w), µm.
     pub rms_um: [f64; 3],
+    /// What photon and read noise alone make of it: RMS of the correlation's σ, decoded.
+    pub noise_um: [f64; 3],
 }
 
 /// The slide and its frames.
@@ -107,6 +105,17 @@ impl Plate {
         Ok(self.scene.microscope.parameters()?.0)
     }
 
+    /// The size of a pixel along y in that along x that the geometry has at the middle of the field.
+    pub fn true_aspect(&self) -> Result<f64, ReproduceError> {
+        let mut magnification = [0.0; 2];
+        for view in View::BOTH {
+            let (_, by) = self.scene.microscope.project_point(view, Vector3::zeros())?;
+            magnification[0] += by[(0, 0)];
+            magnification[1] += by[(1, 1)];
+        }
+        Ok(magnification[0] / magnification[1])
+    }
+
     /// The reference frame as a picture.
     pub fn picture(&self) -> Picture {
         Picture {
@@ -131,7 +140,8 @@ impl Plate {
         let n = pairs.len() as f64;
         let mean = |f: &dyn Fn(usize) -> f64| pairs.iter().enumerate().map(|(k, _)| f(k)).sum::<f64>() / n;
         let disparity_px = [0, 1].map(|i| mean(&|k| pairs[k].plus_px[i] - pairs[k].minus_px[i]));
-        Ok(Measured { plate: self, shape, tracked, disparity_px })
+        let aspect = aspect(&tracked)?;
+        Ok(Measured { plate: self, shape, tracked, disparity_px, aspect })
     }
 }
 
@@ -142,13 +152,44 @@ pub struct Measured<'a> {
     tracked: Vec<Vec<Tracked>>,
     /// Disparity of the slide, px: that of h = 0.
     pub disparity_px: [f64; 2],
+    /// Size of a pixel along y in that along x.
+    pub aspect: f64,
 }
 
-fn motion(by: &Move, tracked: &[Tracked]) -> Motion {
+/// Size of a pixel along y in that along x on the specimen, from the moves in the plane.
+///
+/// (3.1) has one M_xy. But behind the grating the intermediate image stands at D/cos³θ along the grating
+/// vector and at D/cos θ across it, and an objective that is not telecentric (κ per mm) magnifies the two
+/// differently: by about κ D (1/cos³θ − 1/cos θ), here 0.4 %, 0.07 px in 17. So y is counted in pixels of x
+/// before the six parameters are fitted.
+fn aspect(tracked: &[Vec<Tracked>]) -> Result<f64, ReproduceError> {
+    let mut size_mm = [f64::NAN; 2];
+    for (by, tracked) in MOVES.iter().zip(tracked).filter(|(by, _)| by.calibrates) {
+        let points = motion(by, tracked, 1.0).points;
+        for (i, size) in size_mm.iter_mut().enumerate() {
+            let [a, b] = [by.translation_mm[1 - i], by.translation_mm[2]];
+            if by.translation_mm[i] != 0.0 && a == 0.0 && b == 0.0 {
+                let sum: f64 = points.iter().map(|p| 0.5 * (p.moved_px[i] + p.moved_px[2 + i])).sum();
+                *size = by.translation_mm[i] * points.len() as f64 / sum;
+            }
+        }
+    }
+    let aspect = size_mm[1] / size_mm[0];
+    if aspect.is_finite() { Ok(aspect) } else { Err(ReproduceError::Open) }
+}
+
+/// A pair with y in pixels of x.
+pub fn square(pair: PixelPair, aspect: f64) -> PixelPair {
+    let of = |[x, y]: [f64; 2]| [x, y * aspect];
+    PixelPair { minus_px: of(pair.minus_px), plus_px: of(pair.plus_px) }
+}
+
+fn motion(by: &Move, tracked: &[Tracked], aspect: f64) -> Motion {
     let points = tracked
         .iter()
         .map(|t| {
-            let (a, b) = (t.before, t.after);
+            let (a, b) = (square(t.before, aspect), square(t.after, aspect));
+            let [s0, s1, s2, s3] = t.sigma_px;
             FieldPoint {
                 middle_px: [0, 1].map(|i| 0.5 * (a.minus_px[i] + a.plus_px[i])),
                 height_mm: 0.0,
@@ -158,8 +199,7 @@ fn motion(by: &Move, tracked: &[Tracked]) -> Motion {
                     b.plus_px[0] - a.plus_px[0],
                     b.plus_px[1] - a.plus_px[1],
                 ],
-                // what the six parameters leave of exact rays is no noise of the image
-                sigma_px: t.sigma_px.map(|s| s.hypot(MODEL_PX)),
+                sigma_px: [s0, s1 * aspect, s2, s3 * aspect],
             }
         })
         .collect();
@@ -182,7 +222,7 @@ impl Measured<'_> {
             .zip(&self.tracked)
             .enumerate()
             .filter(|(k, (by, _))| by.calibrates || own == Some(*k))
-            .map(|(_, (by, tracked))| motion(by, tracked))
+            .map(|(_, (by, tracked))| motion(by, tracked, self.aspect))
             .collect();
         let shared = (SUBSET as f64 / self.plate.step as f64).powi(2);
         Ok(calibrate(&motions, &Settings { form, shared, ..Settings::default() })?)
@@ -193,23 +233,27 @@ impl Measured<'_> {
         self.calibrate_with(form, None)
     }
 
-    /// The calibrated microscope.
+    /// The calibrated microscope; for pairs with y in pixels of x.
     pub fn model(&self, calibration: &Calibration) -> Result<Microscope, ReproduceError> {
         let parameters = calibration.parameters.ok_or(ReproduceError::Open)?;
-        Ok(Microscope::new(parameters, calibration.form, self.disparity_px)?)
+        let [x, y] = self.disparity_px;
+        Ok(Microscope::new(parameters, calibration.form, [x, y * self.aspect])?)
     }
 
     /// Decoded displacement and its error, µm, at every point (x, y in µm) of move `k`.
-    fn decoded(&self, k: usize, model: &dyn PairModel) -> Result<Vec<Decoded>, ReproduceError> {
+    fn decoded(&self, k: usize, model: &dyn PairModel, aspect: f64) -> Result<Vec<Decoded>, ReproduceError> {
         let none = Matrix4::zeros();
         let mut out = Vec::with_capacity(self.tracked[k].len());
         for t in &self.tracked[k] {
             let place = self.plate.scene.microscope.decode_pair(t.before)?.point_mm;
-            let found = model.track(t.before, t.after, &none, &none)?.displacement_mm;
+            let noise = Matrix4::from_diagonal(&Vector4::from(t.sigma_px.map(|s| s * s)));
+            let (before, after) = (square(t.before, aspect), square(t.after, aspect));
+            let found = model.track(before, after, &none, &noise)?;
             let truth = MOVES[k].of(place);
             out.push(Decoded {
                 place_um: [1e3 * place.x, 1e3 * place.y],
-                found_um: (found * 1e3).into(),
+                found_um: (found.displacement_mm * 1e3).into(),
+                sigma_um: [0, 1, 2].map(|i| 1e3 * found.covariance_mm2[(i, i)].sqrt()),
                 truth_um: (truth * 1e3).into(),
             });
         }
@@ -225,14 +269,14 @@ impl Measured<'_> {
         let mut out = Vec::new();
         for (k, by) in MOVES.iter().enumerate().filter(|(_, m)| !m.calibrates) {
             let own = self.calibrate_with(Form::Perspective, Some(k))?;
-            let models: [(Way, Box<dyn PairModel>); 4] = [
-                (Way::Linear, Box::new(self.model(linear)?)),
-                (Way::Perspective, Box::new(self.model(perspective)?)),
-                (Way::OwnFit, Box::new(self.model(&own)?)),
-                (Way::Rays, Box::new(self.plate.scene.microscope.clone())),
+            let models: [(Way, Box<dyn PairModel>, f64); 4] = [
+                (Way::Linear, Box::new(self.model(linear)?), self.aspect),
+                (Way::Perspective, Box::new(self.model(perspective)?), self.aspect),
+                (Way::OwnFit, Box::new(self.model(&own)?), self.aspect),
+                (Way::Rays, Box::new(self.plate.scene.microscope.clone()), 1.0),
             ];
-            for (way, model) in models {
-                let decoded = self.decoded(k, model.as_ref())?;
+            for (way, model, aspect) in models {
+                let decoded = self.decoded(k, model.as_ref(), aspect)?;
                 let rms_um = [0, 1, 2].map(|i| rms(decoded.iter().map(|d| d.found_um[i] - d.truth_um[i])));
                 out.push(MotionErrors {
                     name: by.name,
@@ -240,6 +284,7 @@ impl Measured<'_> {
                     way,
                     points: decoded.len(),
                     rms_um,
+                    noise_um: [0, 1, 2].map(|i| rms(decoded.iter().map(|d| d.sigma_um[i]))),
                 });
             }
         }
@@ -251,8 +296,8 @@ impl Measured<'_> {
         let model = self.model(perspective)?;
         let mut drawn = Drawn::default();
         for (k, _) in MOVES.iter().enumerate().filter(|(_, m)| !m.calibrates) {
-            drawn.motions.push(self.decoded(k, &model)?);
-            let moved = motion(&MOVES[k], &self.tracked[k]).points;
+            drawn.motions.push(self.decoded(k, &model, self.aspect)?);
+            let moved = motion(&MOVES[k], &self.tracked[k], 1.0).points;
             drawn.moved_px.push(moved.iter().map(|p| (p.middle_px, p.moved_px)).collect());
         }
         Ok(drawn)
@@ -266,6 +311,8 @@ pub struct Decoded {
     pub place_um: [f64; 2],
     /// (u, v, w) found.
     pub found_um: [f64; 3],
+    /// Their σ from the images' noise.
+    pub sigma_um: [f64; 3],
     /// (u, v, w) imposed.
     pub truth_um: [f64; 3],
 }
