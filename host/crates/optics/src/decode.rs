@@ -256,12 +256,15 @@ fn decode<T: Real>(
     }
     let minus = setup.direction(View::Minus, minus)?;
     let plus = setup.direction(View::Plus, plus)?;
-    match decoder {
-        Decoder::Ray => by_rays(setup, minus, plus),
+    let (point, gap) = match decoder {
+        Decoder::Ray => by_rays(setup, minus, plus)?,
         Decoder::Closed | Decoder::Linear => {
-            by_virtual_object(setup, decoder == Decoder::Linear, minus, plus)
+            by_virtual_object(setup, decoder == Decoder::Linear, minus, plus)?
         }
-    }
+    };
+    // distances near the largest number have squares beyond it
+    let finite = point.iter().all(|c| c.value().is_finite()) && gap.value().is_finite();
+    if finite { Ok((point, gap)) } else { Err(TraceError::NotFinite) }
 }
 
 fn by_rays<T: Real>(setup: &Setup<T>, minus: [T; 2], plus: [T; 2]) -> Result<([T; 3], T), TraceError> {
