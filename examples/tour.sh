@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Every command that calibrates, aligns, decodes or plans, on simulated inputs: examples/tour.sh [OUT]
+# Commands that plan, calibrate, align and decode, on simulated inputs, and their answers against the truth:
+# examples/tour.sh [OUT]
 #
 # DAIC and REHEARSAL name the programs; without them cargo builds both.
 set -euo pipefail
@@ -7,9 +8,10 @@ root="$(cd "$(dirname "$0")/.." && pwd)"
 out="${1:-tour}"
 if [ -z "${DAIC:-}" ] || [ -z "${REHEARSAL:-}" ]; then
     cargo build --release --manifest-path "$root/Cargo.toml" -p daic --bin daic --example rehearsal
-    target="${CARGO_TARGET_DIR:-$root/target}/release"
+    target="$(realpath "${CARGO_TARGET_DIR:-$root/target}")/release"
     DAIC="$target/daic" REHEARSAL="$target/examples/rehearsal"
 fi
+DAIC="$(realpath "$DAIC")" REHEARSAL="$(realpath "$REHEARSAL")"
 optics="$root/examples/golden-macro.toml"
 
 step() {
@@ -43,3 +45,6 @@ step decode --optics rig-found/optics.toml rig/pairs.csv --out points.csv
 
 # the microscope, from known motions
 step calibrate microscope microscope/moves.toml --out microscope.toml --report microscope.html
+
+printf '\nthe answers against the truth\n'
+"$REHEARSAL" --check .

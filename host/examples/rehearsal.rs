@@ -1,10 +1,12 @@
-//! Simulated inputs for every command that calibrates, aligns or decodes: `rehearsal OUT`.
-//!
-//! `examples/tour.sh` runs the commands on them, one after the other; the README tells which.
+//! Simulated inputs for the commands that calibrate, align and decode: `rehearsal OUT`; and whether what the commands
+//! of `examples/tour.sh` made of them is the truth: `rehearsal --check OUT`.
 
 #[path = "../crates/optics/tests/rendering/mod.rs"]
 mod rendering;
 
+use daic::camera_file::CameraFile;
+use daic::microscope::MicroscopeFile;
+use daic_dataset::Table;
 use daic_optics::bundle::Pose as PlatePose;
 use daic_optics::{Brown, Camera, OpticalModel, Optics, View};
 use daic_rig::experiment::OpticsFile;
@@ -184,11 +186,100 @@ fit = false
     Ok(std::fs::write(folder.join("moves.toml"), moves)?)
 }
 
+/// A value against the truth, within four of its standard deviations.
+struct Check {
+    failed: usize,
+}
+
+impl Check {
+    fn near(&mut self, what: &str, value: f64, sigma: f64, truth: f64) {
+        let off = (value - truth).abs() / sigma;
+        let good = off < 4.0;
+        println!("{} {what}: {value:.6} ± {sigma:.6}, true {truth:.6}", if good { "ok   " } else { "WRONG" });
+        self.failed += usize::from(!good);
+    }
+
+    fn below(&mut self, what: &str, value: f64, limit: f64) {
+        let good = value < limit;
+        println!("{} {what}: {value:.3e}, limit {limit:.3e}", if good { "ok   " } else { "WRONG" });
+        self.failed += usize::from(!good);
+    }
+}
+
+/// Value and standard deviation of a measured quantity of the alignment's record.
+fn recorded(record: &toml::Table, path: &[&str]) -> Result<[f64; 2], Box<dyn Error>> {
+    let mut at = record.get(path[0]).ok_or(path[0])?;
+    for key in &path[1..] {
+        at = match key.parse::<usize>() {
+            Ok(k) => at.get(k),
+            Err(_) => at.get(key),
+        }
+        .ok_or_else(|| path.join("."))?;
+    }
+    let of = |name: &str| at.get(name).and_then(toml::Value::as_float).ok_or_else(|| path.join("."));
+    Ok([of("value")?, of("sigma")?])
+}
+
+fn check(out: &Path) -> Result<usize, Box<dyn Error>> {
+    let mut check = Check { failed: 0 };
+    let file = CameraFile::load(&out.join("camera-found/camera.toml"))?;
+    for e in &file.estimates {
+        check.near(e.parameter.name(), e.value, e.sigma, e.parameter.get(&camera()));
+    }
+    let record: toml::Table = std::fs::read_to_string(out.join("align.toml"))?.parse()?;
+    for (path, truth) in [
+        (&["rail", "found", "axis", "slope_rad", "0"][..], 4e-3),
+        (&["rail", "found", "axis", "slope_rad", "1"], -2e-3),
+        (&["laser", "found", "axis", "slope_rad", "0"], 3e-3),
+        (&["laser", "found", "axis", "slope_rad", "1"], 0.0),
+        (&["reflection", "found", "tilt_rad", "0"], 0.0),
+        (&["reflection", "found", "tilt_rad", "1"], 2e-3),
+        (&["orders", "found", "first", "angle_rad"], 5e-3),
+        (&["distance", "found", "pinhole_to_grating_mm"], 90.0),
+    ] {
+        let [value, sigma] = recorded(&record, path)?;
+        check.near(&path.join("."), value, sigma, truth);
+    }
+    let points = Table::read_csv(&out.join("points.csv"))?;
+    let path = out.join("points.csv");
+    let column = |name: &str| points.numbers(name, &path);
+    let (x, h) = (column("x_mm")?, column("h_mm")?);
+    let sigma: Vec<f64> =
+        column("sigma_h_mm")?.iter().zip(column("sigma_h_cal_mm")?).map(|(a, b)| a.hypot(b)).collect();
+    let rms =
+        |values: &mut dyn Iterator<Item = f64>| (values.map(|v| v * v).sum::<f64>() / x.len() as f64).sqrt();
+    let error = rms(&mut x.iter().zip(&h).map(|(x, h)| h - ((36.0_f64.powi(2) - x * x).sqrt() - 35.0)));
+    // 1 200 points' own noise, and one draw of the calibration's
+    check.below("height of the cylinder, RMS over stated σ", error / rms(&mut sigma.iter().copied()), 1.6);
+    let scope = MicroscopeFile::load(&out.join("microscope.toml"))?.microscope;
+    let found = [
+        ("beta1", scope.beta1_um_per_px, 2.295),
+        ("beta2", scope.beta2_um_per_px, 0.53),
+        ("beta3", scope.beta3_per_px, 2.12e-4),
+        ("beta4", scope.beta4_per_px, 2.0e-4),
+        ("centre_x", scope.centre_px[0], 322.0),
+        ("centre_y", scope.centre_px[1], 287.5),
+    ];
+    for (k, (name, value, truth)) in found.into_iter().enumerate() {
+        check.near(name, value, scope.covariance[k][k].sqrt(), truth);
+    }
+    Ok(check.failed)
+}
+
 fn main() -> Result<(), Box<dyn Error>> {
-    let Some(out) = std::env::args_os().nth(1) else {
-        return Err("rehearsal OUT: give the folder for the inputs".into());
+    let arguments: Vec<_> = std::env::args_os().skip(1).collect();
+    let out = match arguments.as_slice() {
+        [flag, out] if flag == "--check" => {
+            let failed = check(Path::new(out))?;
+            return if failed == 0 {
+                Ok(())
+            } else {
+                Err(format!("{failed} results are not the truth").into())
+            };
+        }
+        [out] => Path::new(out),
+        _ => return Err("rehearsal OUT or rehearsal --check OUT".into()),
     };
-    let out = Path::new(&out);
     let start = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/golden-macro.toml");
     for folder in ["camera", "align", "rig", "microscope"] {
         std::fs::create_dir_all(out.join(folder))?;

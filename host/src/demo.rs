@@ -30,9 +30,9 @@ const MOVE_LIMIT_UM: [f64; 3] = [1.0, 1.0, 2.0];
 const PROFILE_LIMIT_UM: f64 = 1.0;
 
 /// Limits under the microscope: measured minus commanded displacement, RMS over the field (x, y, h).
-const MICROSCOPE_MOVE_LIMIT_UM: [f64; 3] = [0.02, 0.02, 0.06];
+const MICROSCOPE_MOVE_LIMIT_UM: [f64; 3] = [0.01, 0.01, 0.03];
 /// Measured height minus the specimen's formula, both from their means, RMS over the field.
-const MICROSCOPE_PROFILE_LIMIT_UM: f64 = 0.06;
+const MICROSCOPE_PROFILE_LIMIT_UM: f64 = 0.02;
 /// β₁ and β₂ against those of the simulated geometry.
 const BETA_LIMIT: f64 = 2e-3;
 

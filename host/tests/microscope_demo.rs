@@ -76,7 +76,8 @@ fn a_move_under_the_microscope_comes_back() {
         let rms = (squares / ok as f64).sqrt();
         assert!((rms - summary["rms_um"][i].as_f64().expect("a number")).abs() < 1e-9, "{name}");
         // The literature's set-up: 0.038, 0.022 and 0.232 µm for a translation of 10 µm.
-        assert!(rms < [0.02, 0.02, 0.06][i], "{name}: {rms} µm");
+        // Measured: 0.0020, 0.0020, 0.0043.
+        assert!(rms < [0.003, 0.003, 0.006][i], "{name}: {rms} µm");
     }
 
     // the calibration is that of the simulated geometry

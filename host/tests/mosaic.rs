@@ -112,7 +112,7 @@ fn a_channel_measures_where_its_pixels_are() {
         eprintln!("{name}: stated {:.3?} µm, displacement {:.3?} µm", sigma[0], sigma[1]);
         for (found, stated) in rms.iter().flatten().zip(sigma.iter().flatten()) {
             // subsets overlap: 169 points are worth about 7, whose RMS scatters by 27 %; two of that
-            assert!(found / stated < 1.55, "{name}: {found} µm, stated {stated}");
+            assert!((0.45..1.55).contains(&(found / stated)), "{name}: {found} µm, stated {stated}");
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use daic_correlate::Shape;
 use daic_tests::reproduce::macroscopic::{self, CONFINED_PX, Decoding};
-use daic_tests::reproduce::microscopic::{self, THESIS, Way};
+use daic_tests::reproduce::microscopic::{self, RIGID, THESIS, Way};
 use daic_tests::reproduce::{Extent, document};
 
 #[test]
@@ -37,7 +37,7 @@ fn chapter_3_on_a_small_field() {
     eprintln!("{}", part.text);
     let (translation, tilt, ball) = THESIS;
     for (number, thesis) in [translation, tilt].into_iter().enumerate() {
-        let ours = results.motion(number, Shape::Quadratic, Way::Perspective).expect("a motion");
+        let ours = results.motion(number, RIGID, Way::Perspective).expect("a motion");
         for (error, limit) in ours.rms_um.into_iter().zip(thesis) {
             // "each at least 5× smaller"
             assert!(5.0 * error <= limit, "{}: {:?} µm", ours.name, ours.rms_um);

@@ -9,6 +9,9 @@ use daic_correlate::{
 use daic_optics::{PairModel, PixelPair, View};
 use nalgebra::Vector3;
 
+/// Largest displacement that is searched, px: 20 µm.
+const REACH_PX: f64 = 40.0;
+
 /// A pair that was followed into another frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Tracked {
@@ -100,7 +103,9 @@ impl Matched {
         let run = |reference: &Reference, points: &Points, guess: &Guess<'_>| {
             correlate(reference, &target, points, guess, &self.settings, &())
         };
-        let first = [&self.minus, &plus].map(|points| run(self.bank.sharp(), points, &Guess::Auto));
+        // the other view shows the same particles: it must stay out of reach
+        let near = Guess::Search { u: (-REACH_PX, REACH_PX), v: (-REACH_PX, REACH_PX) };
+        let first = [&self.minus, &plus].map(|points| run(self.bank.sharp(), points, &near));
         let [left, right] = first;
         let (left, right) = (left?, right?);
         let moves = |found: &[Point]| -> Vec<Option<[f64; 2]>> {

@@ -7,7 +7,7 @@ mod profile;
 mod rigid;
 mod scene;
 
-pub use page::{THESIS, part};
+pub use page::{RIGID, THESIS, part};
 pub use profile::{Ball, Ring};
 pub use rigid::{MotionErrors, Way};
 
