@@ -158,8 +158,7 @@ fn a_rigid_tilt_has_no_strain() {
     let motion = |p: Vector3<f64>| turn * p + Vector3::new(0.1, 0.05, 0.2);
     let settings = Settings { window: 9, overlap: 0.0, ..Settings::default() };
     type Height = fn(f64, f64) -> f64;
-    let surfaces: [(&str, Height); 2] =
-        [("plane", |_, _| 0.0), ("cylinder", |x, _| cylinder(x))];
+    let surfaces: [(&str, Height); 2] = [("plane", |_, _| 0.0), ("cylinder", |x, _| cylinder(x))];
     for (name, h) in surfaces {
         let exact = surface_strain(&moved(&truth, &h, &motion, 0.0, 7), &settings, 59).unwrap();
         let worst =

@@ -68,6 +68,9 @@ fn outcome_of(mut command: Command) -> Outcome {
 pub fn test() -> Report {
     let mut report = Report::default();
     report.step("tests of the workspace", || outcome_of(cargo(&["test", "--workspace", "--locked"])));
+    report.step("distortion map of a simulated target", || {
+        distortion_map(&root().join("target/line-target"), "480x360", &[])
+    });
     report.step("firmware for thumbv6m-none-eabi", thumb);
     report.step("instruction counts of the correlation (callgrind)", || crate::bench::guard::guard(false));
     report.step("data of others", || {
@@ -82,6 +85,25 @@ pub fn test() -> Report {
         }
     });
     report
+}
+
+/// `daic calibrate distortion` on the images that the example writes; the results are in `folder`/map.
+fn distortion_map(folder: &Path, size: &str, profile: &[&str]) -> Outcome {
+    let run = |arguments: &[&str]| {
+        let mut command = cargo(&["run", "--locked", "--package", "daic"]);
+        command.args(profile).args(arguments);
+        command
+    };
+    let mut images = run(&["--example", "line_target", "--"]);
+    images.arg(folder).arg(size);
+    match outcome_of(images) {
+        Outcome::Passed => {}
+        failed => return failed,
+    }
+    let mut calibrate = run(&["--", "calibrate", "distortion"]);
+    calibrate.args(["along_x.png", "along_y.png"].map(|name| folder.join(name)));
+    calibrate.arg("--out").arg(folder.join("map"));
+    outcome_of(calibrate)
 }
 
 /// Builds protocol and firmware for the Pico's core, with a toolchain brought into `target/thumb`
@@ -167,6 +189,21 @@ pub fn figures() -> Report {
             std::fs::copy(out.join("results/figures").join(&file), to.join(&file)).map(|_| ())
         };
         match std::fs::create_dir_all(&to).and_then(|()| FIGURES.iter().try_for_each(|name| copy(name))) {
+            Ok(()) => Outcome::Passed,
+            Err(error) => Outcome::Failed(error.to_string()),
+        }
+    });
+    report.step("a distortion map into docs/figures", || {
+        let folder = root().join("target/figures-target");
+        match distortion_map(&folder, "2592x1944", &["--release"]) {
+            Outcome::Passed => {}
+            failed => return failed,
+        }
+        let copy = |name: &str| {
+            let to = root().join(format!("docs/figures/distortion-{name}.svg"));
+            std::fs::copy(folder.join(format!("map/{name}.svg")), to).map(|_| ())
+        };
+        match ["e_x", "e_y", "left_x"].into_iter().try_for_each(copy) {
             Ok(()) => Outcome::Passed,
             Err(error) => Outcome::Failed(error.to_string()),
         }
