@@ -210,6 +210,19 @@ pub enum Error {
         /// Why.
         source: daic_correlate::phase::PhaseError,
     },
+    /// One image, and only one direction of lines in it.
+    #[error(
+        "{} shows lines in one direction only (their normal at {angle_deg:.1}°, {pitch_px:.2} px apart): a single image must be of a cross grating; of lines give two, along x and along y",
+        path.display()
+    )]
+    OneImageOfLines {
+        /// The image.
+        path: PathBuf,
+        /// Distance of the lines.
+        pitch_px: f64,
+        /// Angle of their normal against x.
+        angle_deg: f64,
+    },
     /// Neither one image nor two.
     #[error(
         "{found} images of a target given: give one of a cross grating, or two, of lines along x and of lines along y"

@@ -4,6 +4,7 @@ use crate::distortion_file::{DistortionFile, IdealImage};
 use crate::error::Error;
 use crate::measure::{Instrument, MapQuality};
 use crate::optics_section;
+use daic_dataset::atomic;
 use daic_optics::bundle::Volume;
 use daic_optics::{Decoder, DistortionMaps, OpticalModel, Optics, ParameterCovariance, View};
 use daic_rig::experiment::{MapFile, Maps, OpticsFile};
@@ -183,6 +184,78 @@ pub fn map_entry(folder: &Path, map: &Path) -> Result<MapFile, Error> {
     let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
     let file = relative(&read(folder)?, &read(map)?);
     Ok(MapFile { file: file.to_string_lossy().replace('\\', "/"), crc64: checksum(&bytes) })
+}
+
+/// Name of the entry of `[maps]` for a view; none is the whole sensor.
+pub fn entry_name(view: Option<View>) -> &'static str {
+    match view {
+        None => "sensor",
+        Some(View::Minus) => "minus",
+        Some(View::Plus) => "plus",
+    }
+}
+
+/// Whether a map that was made without the file's other maps can be named in it.
+///
+/// # Errors
+/// The file, if it is not a readable optics file; [`Error::OpticsMap`] where it is a whole experiment or
+/// another map would add up with this one.
+pub fn can_name_map(optics: &Path, view: Option<View>) -> Result<(), Error> {
+    let name = entry_name(view);
+    let wrong = |name, reason: String| Error::OpticsMap { path: optics.to_owned(), name, reason };
+    let maps = OpticsFile::load(optics)?.maps.unwrap_or_default();
+    if document(optics, name)?.contains_key("rig") {
+        let reason = "this is an experiment; maps are named in an optics file of its own".to_owned();
+        return Err(wrong(name, reason));
+    }
+    let others: &[_] = match view {
+        None => &[("minus", &maps.minus), ("plus", &maps.plus)],
+        Some(_) => &[("sensor", &maps.sensor)],
+    };
+    match others.iter().find(|(_, map)| map.is_some()) {
+        Some((other, _)) => Err(wrong(
+            other,
+            format!(
+                "it would add up with the map for maps.{name}, which is counted without it: remove the entry first"
+            ),
+        )),
+        None => Ok(()),
+    }
+}
+
+/// Names a map in an optics file, in place of the one that was there; all else stays as it is, comments
+/// included. The file is replaced in one step.
+///
+/// # Errors
+/// As [`can_name_map`], and if the file cannot be written.
+pub fn name_map(optics: &Path, view: Option<View>, entry: &MapFile) -> Result<(), Error> {
+    can_name_map(optics, view)?;
+    let name = entry_name(view);
+    let mut document = document(optics, name)?;
+    let maps = document.entry("maps").or_insert_with(|| {
+        let mut table = toml_edit::Table::new();
+        table.set_implicit(true);
+        toml_edit::Item::Table(table)
+    });
+    let mut table = toml_edit::Table::new();
+    table.insert("file", toml_edit::value(&entry.file));
+    table.insert("crc64", toml_edit::value(&entry.crc64));
+    if let Some(maps) = maps.as_table_like_mut() {
+        maps.insert(name, toml_edit::Item::Table(table));
+    }
+    let text = document.to_string();
+    OpticsFile::parse(&text, optics)?;
+    Ok(atomic::write_bytes(optics, text.as_bytes())?)
+}
+
+fn document(path: &Path, name: &'static str) -> Result<toml_edit::DocumentMut, Error> {
+    let text =
+        std::fs::read_to_string(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+    text.parse().map_err(|e: toml_edit::TomlError| Error::OpticsMap {
+        path: path.to_owned(),
+        name,
+        reason: e.to_string(),
+    })
 }
 
 /// The entries of a file in `from` for one in `to`: the same maps.

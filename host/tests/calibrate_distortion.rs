@@ -11,18 +11,14 @@ use daic_optics::{DistortionError, DistortionMaps, OpticalModel, Optics, View};
 use nalgebra::{DMatrix, DVector};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use target::{Lines, Noise, Pose, Scene, brightness, grey, save};
+use target::{Lines, Noise, OTHER, POSE, Pose, Scene, brightness, grey, save};
 
 const SIZE: [usize; 2] = [700, 520];
-/// One degree in the plane and one out of it.
-const POSE: Pose = Pose { turn_deg: 1.0, tilt_deg: [0.6, -0.8] };
-/// Another of the same size, for the other exposure.
-const OTHER: Pose = Pose { turn_deg: -1.0, tilt_deg: [-1.0, 0.0] };
-
 fn options(images: Vec<PathBuf>, out: &Path) -> Options {
     Options {
         images,
         optics: None,
+        into: false,
         view: None,
         region: None,
         ideal: None,
@@ -61,6 +57,8 @@ fn images(folder: &Path, scene: &Scene, poses: [Pose; 2], cross: bool, seed: u64
 /// A pixel's ideal position by the map, and the target's true phases there.
 struct Straightened {
     ideal: [f64; 2],
+    /// Stated there.
+    sigma: [f64; 2],
     turns: [f64; 2],
 }
 
@@ -131,7 +129,8 @@ fn straightened(
             let inside = found.measured[k] && around.iter().all(|m| *m);
             if inside == measured {
                 let e = found.map.e_px(o).unwrap();
-                points.push(Straightened { ideal: [o[0] - e[0], o[1] - e[1]], turns: turns(o) });
+                let ideal = [o[0] - e[0], o[1] - e[1]];
+                points.push(Straightened { ideal, sigma: found.sigma_px[k], turns: turns(o) });
             }
         }
     }
@@ -161,6 +160,14 @@ fn check(scene: &Scene, cross: bool, one_pose: bool, limit: f64) -> Outcome {
         found.left,
         rms(&bx),
         rms(&by)
+    );
+    let in_sigma = |points: &[Straightened], left: [&Vec<f64>; 2]| {
+        [0, 1].map(|i| rms(&points.iter().zip(left[i]).map(|(p, v)| v / p.sigma[i]).collect::<Vec<f64>>()))
+    };
+    println!(
+        "  error over σ: {:.3?} at measured nodes, {:.3?} in the border",
+        in_sigma(&inside, [&x, &y]),
+        in_sigma(&border, [&bx, &by])
     );
     println!("  brown {:?} ± {:?}", found.brown.brown, found.brown.sigma);
     assert!(inside.len() > scene.size[0] * scene.size[1] / 49 / 2, "{}", inside.len());
@@ -258,7 +265,7 @@ fn stated_uncertainty_is_the_scatter_of_repeats() {
             for i in 0..2 {
                 let mean = e.iter().map(|e| e[i]).sum::<f64>() / REPEATS as f64;
                 let scatter = e.iter().map(|e| (e[i] - mean).powi(2)).sum::<f64>() / (REPEATS - 1) as f64;
-                let stated = all.iter().map(|f| f.sigma_px[k][i].powi(2)).sum::<f64>() / REPEATS as f64;
+                let stated = all.iter().map(|f| f.noise_px[k][i].powi(2)).sum::<f64>() / REPEATS as f64;
                 if all.iter().all(|f| f.measured[k]) {
                     ratio[i] += scatter / stated;
                     count[0] += 0.5;
@@ -391,7 +398,18 @@ fn bad_input_is_named() {
     let same = matches!(&e, Error::CalibrateDistortion(DistortionError::SameDirection { .. }));
     assert!(same && e.to_string().contains("lines along y"), "{e}");
     let e = with(&good[..1]).unwrap_err();
-    assert!(matches!(e, Error::TargetPhase { .. }), "{e}");
+    assert!(matches!(e, Error::OneImageOfLines { .. }), "{e}");
+    // A strip narrower than the window of ten lines.
+    let strip = |name: &str, lines, pose: &Pose| {
+        let all = scene.brightness(pose, lines);
+        let part = all.iter().enumerate().map(|(k, b)| if k % size[0] < 90 { *b } else { 0.1 });
+        save(&path(name), size, grey(&part.collect::<Vec<f64>>(), &mut Noise::new(6)));
+        path(name)
+    };
+    let strips = [strip("sx.png", Lines::CrossedByX, &POSE), strip("sy.png", Lines::CrossedByY, &OTHER)];
+    let e = with(&strips).unwrap_err();
+    let few = matches!(&e, Error::CalibrateDistortion(DistortionError::TooFew { .. }));
+    assert!(few && e.to_string().contains("analysis window"), "{e}");
     assert!(matches!(with(&[]), Err(Error::TargetImages { found: 0 })));
     let rays = Options { ideal: Some(IdealImage::Ray), ..options(good.clone(), folder.path()) };
     assert!(matches!(calibrate(&rays), Err(Error::IdealRay)));

@@ -69,6 +69,9 @@ pub fn test() -> Report {
     let mut report = Report::default();
     report.step("tests of the workspace", || outcome_of(cargo(&["test", "--workspace", "--locked"])));
     report.step("the tour of the examples", tour);
+    report.step("distortion map of a simulated target", || {
+        distortion_map(&root().join("target/line-target"), "480x360", Profile::Debug)
+    });
     report.step("firmware for thumbv6m-none-eabi", thumb);
     report.step("instruction counts of the correlation (callgrind)", || crate::bench::guard::guard(false));
     report.step("data of others", || {
@@ -85,19 +88,65 @@ pub fn test() -> Report {
     report
 }
 
-/// Every command that calibrates, aligns, decodes or plans, on simulated inputs.
-fn tour() -> Outcome {
-    let build = ["build", "--locked", "--package", "daic", "--bin", "daic", "--example", "rehearsal"];
-    match outcome_of(cargo(&build)) {
-        Outcome::Passed => {}
-        other => return other,
+/// Where programs are built.
+#[derive(Clone, Copy)]
+enum Profile {
+    Debug,
+    Release,
+}
+
+/// Builds programs of `daic`, with the features of the whole workspace, so that nothing is built twice; gives their folder.
+fn programs(profile: Profile, names: &[&str]) -> Result<PathBuf, Outcome> {
+    let mut build = cargo(&["build", "--locked", "--workspace"]);
+    let folder = match profile {
+        Profile::Debug => "debug",
+        Profile::Release => {
+            build.arg("--release");
+            "release"
+        }
+    };
+    match outcome_of({
+        build.args(names);
+        build
+    }) {
+        Outcome::Passed => {
+            let target =
+                std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root().join("target"), PathBuf::from);
+            Ok(target.join(folder))
+        }
+        failed => Err(failed),
     }
-    let target = std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root().join("target"), PathBuf::from);
-    let built = target.join("debug");
+}
+
+/// Commands that plan, calibrate, align and decode, on simulated inputs, and their answers against the truth.
+fn tour() -> Outcome {
+    let built = match programs(Profile::Debug, &["--bin", "daic", "--example", "rehearsal"]) {
+        Ok(built) => built,
+        Err(failed) => return failed,
+    };
     let mut command = Command::new("bash");
-    command.arg(root().join("examples/tour.sh")).arg(target.join("tour"));
+    command.arg(root().join("examples/tour.sh")).arg(built.join("../tour"));
     command.env("DAIC", built.join("daic")).env("REHEARSAL", built.join("examples/rehearsal"));
     outcome_of(command)
+}
+
+/// `daic calibrate distortion` on the images that the example writes; the results are in `folder`/map.
+fn distortion_map(folder: &Path, size: &str, profile: Profile) -> Outcome {
+    let built = match programs(profile, &["--bin", "daic", "--example", "line_target"]) {
+        Ok(built) => built,
+        Err(failed) => return failed,
+    };
+    let mut images = Command::new(built.join("examples/line_target"));
+    images.arg(folder).arg(size);
+    match outcome_of(images) {
+        Outcome::Passed => {}
+        failed => return failed,
+    }
+    let mut calibrate = Command::new(built.join("daic"));
+    calibrate.args(["calibrate", "distortion"]);
+    calibrate.args(["along_x.png", "along_y.png"].map(|name| folder.join(name)));
+    calibrate.arg("--out").arg(folder.join("map"));
+    outcome_of(calibrate)
 }
 
 /// Builds protocol and firmware for the Pico's core, with a toolchain brought into `target/thumb`
@@ -183,6 +232,21 @@ pub fn figures() -> Report {
             std::fs::copy(out.join("results/figures").join(&file), to.join(&file)).map(|_| ())
         };
         match std::fs::create_dir_all(&to).and_then(|()| FIGURES.iter().try_for_each(|name| copy(name))) {
+            Ok(()) => Outcome::Passed,
+            Err(error) => Outcome::Failed(error.to_string()),
+        }
+    });
+    report.step("a distortion map into docs/figures", || {
+        let folder = root().join("target/figures-target");
+        match distortion_map(&folder, "2592x1944", Profile::Release) {
+            Outcome::Passed => {}
+            failed => return failed,
+        }
+        let copy = |name: &str| {
+            let to = root().join(format!("docs/figures/distortion-{name}.svg"));
+            std::fs::copy(folder.join(format!("map/{name}.svg")), to).map(|_| ())
+        };
+        match ["e_x", "e_y", "left_x"].into_iter().try_for_each(copy) {
             Ok(()) => Outcome::Passed,
             Err(error) => Outcome::Failed(error.to_string()),
         }

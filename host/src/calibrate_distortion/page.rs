@@ -1,6 +1,8 @@
 //! Figures and report of a distortion calibration.
 
-use super::{Options, Outcome, image_kind, listed, maps};
+use super::summary::{image_kind, listed};
+use super::write::maps;
+use super::{Options, Outcome};
 use crate::error::Error;
 use daic_dataset::FloatMap;
 use daic_report::{

@@ -19,6 +19,9 @@ pub struct DistortionArgs {
     /// it is counted from
     #[arg(long, value_name = "FILE")]
     optics: Option<PathBuf>,
+    /// Optics file that the map is named in, in one step with its checksum; also read as --optics is
+    #[arg(long, value_name = "FILE", conflicts_with = "optics")]
+    into: Option<PathBuf>,
     /// The images show the target through the grating, in this view
     #[arg(long)]
     view: Option<ViewArg>,
@@ -74,7 +77,8 @@ pub fn calibrate(arguments: &DistortionArgs, output: &Output) -> Result<Answer, 
     (phase.width, phase.pitch, phase.noise) = (arguments.width, arguments.pitch, arguments.noise);
     let summary = calibrate_distortion::run(&Options {
         images: arguments.images.clone(),
-        optics: arguments.optics.clone(),
+        optics: arguments.into.clone().or_else(|| arguments.optics.clone()),
+        into: arguments.into.is_some(),
         view: arguments.view.map(|v| match v {
             ViewArg::Minus => View::Minus,
             ViewArg::Plus => View::Plus,
@@ -113,6 +117,15 @@ pub fn calibrate(arguments: &DistortionArgs, output: &Output) -> Result<Answer, 
     for warning in &summary.warnings {
         writeln!(text, "warning: {warning}").ok();
     }
-    write!(text, "map: {}", summary.map.display()).ok();
+    writeln!(text, "map: {}", summary.map.display()).ok();
+    match &summary.into {
+        Some(into) => write!(text, "named as {} in {}", summary.entry_name, into.display()),
+        None => {
+            writeln!(text, "in an optics file (--into FILE writes it):\n").ok();
+            writeln!(text, "[{}]", summary.entry_name).ok();
+            write!(text, "file = {:?}\ncrc64 = {:?}", summary.entry.file, summary.entry.crc64)
+        }
+    }
+    .ok();
     Ok(Answer::new(as_json(&summary)?, text))
 }

@@ -19,6 +19,11 @@ pub struct Pose {
     pub tilt_deg: [f64; 2],
 }
 
+/// One degree in the plane and one out of it.
+pub const POSE: Pose = Pose { turn_deg: 1.0, tilt_deg: [0.6, -0.8] };
+/// Another of the same size, for the other exposure.
+pub const OTHER: Pose = Pose { turn_deg: -1.0, tilt_deg: [-1.0, 0.0] };
+
 /// A camera with its distortions, in front of a target.
 #[derive(Clone, Debug)]
 pub struct Scene {
@@ -204,7 +209,8 @@ impl Noise {
         Self(seed)
     }
 
-    fn uniform(&mut self) -> f64 {
+    /// Evenly between 0 and 1.
+    pub fn uniform(&mut self) -> f64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
         z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);

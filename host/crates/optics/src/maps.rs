@@ -159,10 +159,13 @@ impl MapFit {
         let grid = &self.map.grid;
         let [nx, ny] = grid.coefficients();
         let mut row = vec![0.0; nx * ny];
-        for (a, v) in basis(grid, pixel_px) {
+        let basis = basis(grid, pixel_px);
+        for (a, v) in basis {
             row[a] += v;
         }
-        Influence { grid, by_coefficient: self.factor.solve(row) }
+        let by_coefficient = self.factor.solve(row);
+        let variance = basis.iter().map(|(a, v)| v * by_coefficient[*a]).sum();
+        Influence { grid, by_coefficient, variance }
     }
 }
 
@@ -170,9 +173,15 @@ impl MapFit {
 pub(crate) struct Influence<'a> {
     grid: &'a MapGrid,
     by_coefficient: Vec<f64>,
+    variance: f64,
 }
 
 impl Influence<'_> {
+    /// Square of [`MapFit::sigma_px`].
+    pub(crate) fn variance(&self) -> f64 {
+        self.variance
+    }
+
     /// Change of the map per change of the sample's value.
     pub(crate) fn weight(&self, sample: &MapSample) -> f64 {
         let sum: f64 =

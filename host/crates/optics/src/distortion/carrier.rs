@@ -111,13 +111,30 @@ pub(super) struct Carrier {
 /// e at a sample, and its derivatives.
 pub(super) struct Distortion {
     pub(super) e: [f64; 2],
-    /// Standard deviation of e from that of the phases.
-    pub(super) sigma: [f64; 2],
+    /// Change of e_i per standard deviation of phase k.
+    pub(super) by_noise: [[f64; 2]; 2],
     by_carrier: [[f64; 10]; 2],
     by_brown: [[f64; 5]; 2],
 }
 
+impl Distortion {
+    /// Derivatives of (e_x, e_y) by the first `carrier` terms of the carrier, then by those of Brown's terms
+    /// that are `free`.
+    pub(super) fn terms(&self, carrier: usize, free: &[usize]) -> [DVector<f64>; 2] {
+        [0, 1].map(|i| {
+            let brown = free.iter().map(|k| self.by_brown[i][*k]);
+            let all = self.by_carrier[i][..carrier].iter().copied().chain(brown);
+            DVector::from_iterator(carrier + free.len(), all)
+        })
+    }
+}
+
 impl Carrier {
+    /// Number of its terms.
+    pub(super) fn terms(&self) -> usize {
+        self.h.len()
+    }
+
     /// The planes through both phases.
     pub(super) fn start(
         samples: &[Sample],
@@ -214,7 +231,7 @@ impl Carrier {
         let sigma_t = [0, 1].map(|k| s.sigma[k] / self.turns_scale[k]);
         Some(Distortion {
             e: [0, 1].map(|i| s.pixel[i] - seen.pixel[i]),
-            sigma: m.map(|m| (m[0] * sigma_t[0]).hypot(m[1] * sigma_t[1])),
+            by_noise: m.map(|m| [m[0] * sigma_t[0], m[1] * sigma_t[1]]),
             by_carrier,
             by_brown: seen.by_brown.map(|b| b.map(|v| -v)),
         })

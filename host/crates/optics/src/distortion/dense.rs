@@ -1,12 +1,14 @@
-//! The dense map, its uncertainty, and what it leaves.
+//! The dense map, and what it leaves.
 
 use super::carrier::{Fit, Prediction, Sample, rms};
+use super::noise::{Measured, Noise};
 use super::parts::Grid;
-use super::{DistortionError, Left, TargetPhases};
-use crate::maps::{DistortionMap, MapFit, MapSample};
+use super::{BrownFit, DistortionError, Left, TargetPhases};
+use crate::maps::{DistortionMap, MapSample};
 
 pub(super) struct Dense {
     pub(super) map: DistortionMap,
+    pub(super) noise: Vec<[f64; 2]>,
     pub(super) sigma: Vec<[f64; 2]>,
     pub(super) measured: Vec<bool>,
     pub(super) left: Left,
@@ -18,48 +20,50 @@ pub(super) fn make(
     samples: &[(usize, Sample)],
     prediction: &Prediction,
     only: &Fit,
-    base: &[[f64; 2]],
+    brown: &BrownFit,
 ) -> Result<Dense, DistortionError> {
     let [nx, ny] = grid.map.nodes;
-    let mut rest = vec![None; nx * ny];
-    let mut own = vec![None; nx * ny];
+    let base = &brown.e_px;
+    let mut at: Vec<Option<Measured>> = (0..nx * ny).map(|_| None).collect();
     for (node, s) in samples {
         let d = only
             .carrier
             .distortion(s, prediction, &only.brown)
             .ok_or(DistortionError::Unpredictable { pixel_px: s.pixel })?;
-        rest[*node] = Some([0, 1].map(|i| d.e[i] - base[*node][i]));
-        own[*node] = Some(d.sigma);
+        let mean: f64 = d.by_noise.iter().flatten().map(|v| 0.5 * v * v).sum();
+        at[*node] = Some(Measured {
+            sample: MapSample {
+                pixel_px: grid.map.node_px(node % nx, node / nx),
+                e_px: [0, 1].map(|i| d.e[i] - base[*node][i]),
+                // Noise of zero would make the fit an interpolation; the phases are no better than this.
+                sigma_px: mean.sqrt().max(1e-5),
+            },
+            by_noise: d.by_noise,
+        });
     }
-    let scattered: Vec<MapSample> = (0..nx * ny)
-        .filter_map(|k| {
-            let (e_px, sigma) = (rest[k]?, own[k]?);
-            // Noise of zero would make the fit an interpolation; the phases are no better than this.
-            let sigma_px = (0.5 * (sigma[0].powi(2) + sigma[1].powi(2))).sqrt().max(1e-5);
-            Some(MapSample { pixel_px: grid.map.node_px(k % nx, k / nx), e_px, sigma_px })
-        })
-        .collect();
-    let bend = bend(&rest, nx).max(1e-5);
-    let fitted = DistortionMap::fit(grid.map, &scattered, bend)?;
-    let at = |k: usize| grid.map.node_px(k % nx, k / nx);
+    let rest: Vec<Option<[f64; 2]>> = at.iter().map(|m| Some(m.as_ref()?.sample.e_px)).collect();
+    let scattered: Vec<MapSample> = at.iter().flatten().map(|m| m.sample).collect();
+    let bend_px = bend(&rest, nx).max(1e-5);
+    let fitted = DistortionMap::fit(grid.map, &scattered, bend_px)?.map;
     let values: Vec<[f64; 2]> = (0..nx * ny)
         .map(|k| {
-            let r = fitted.map.e_px(at(k)).unwrap_or([0.0; 2]);
+            let r = fitted.e_px(grid.map.node_px(k % nx, k / nx)).unwrap_or([0.0; 2]);
             [0, 1].map(|i| base[k][i] + r[i])
         })
         .collect();
     let map = DistortionMap::interpolate(grid.map, &values)?;
-    let sigma = sigmas(grid, phases, &fitted, &scattered, &own);
-    let measured: Vec<bool> = rest.iter().map(Option::is_some).collect();
+    let measured: Vec<bool> = at.iter().map(Option::is_some).collect();
 
-    let between = between(grid, phases, samples, prediction, only, &map);
-    let noise: Vec<[f64; 2]> = (0..nx * ny).filter(|k| measured[*k]).map(|k| sigma[k]).collect();
+    let found = Noise { grid, phases, at: &at, bend_px }.sigmas(samples, prediction, only, brown)?;
+    let sigma = found.noise.iter().zip(&found.stray).map(|(n, s)| n.map(|n| n.hypot(*s))).collect();
+    let between = rms(&between(grid, phases, samples, prediction, only, &map));
+    let noise: Vec<[f64; 2]> = (0..nx * ny).filter(|k| measured[*k]).map(|k| found.noise[k]).collect();
     let left = Left {
-        between_nodes_px: rms(&between),
+        between_nodes_px: [0, 1].map(|i| (between[i].powi(2) - found.between[i].powi(2)).max(0.0).sqrt()),
         noise_px: rms(&noise),
-        window_px: rms(&taken_off(grid, phases, &fitted.map, &measured)),
+        window_px: rms(&taken_off(grid, phases, &fitted, &measured)),
     };
-    Ok(Dense { map, sigma, measured, left })
+    Ok(Dense { map, noise: found.noise, sigma, measured, left })
 }
 
 /// Measured e less the map half-way between nodes, where the phases have not been used.
@@ -117,96 +121,6 @@ fn bend(rest: &[Option<[f64; 2]>], nx: usize) -> f64 {
         }
     }
     if n > 0.0 { f64::sqrt(sum / n) } else { 0.0 }
-}
-
-/// Correlation of noise averaged with `window` at two places `lag` pixels apart.
-fn correlation(window: &[f32], lag: usize) -> f64 {
-    let product = |lag: usize| -> f64 {
-        window.iter().zip(window.get(lag..).unwrap_or(&[])).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
-    };
-    product(lag) / product(0)
-}
-
-/// Nodes around one that its noise is followed over.
-const FOLLOWED: usize = 8;
-
-/// σ at the nodes. The fit takes the samples' noise as independent, but windows overlap: at the node
-/// that is farthest from any gap the noise is followed exactly, through the fit's weights and the
-/// overlap of the windows. Nodes amid others are smoothed alike; the rest has what the fit says,
-/// widened by the same ratio.
-fn sigmas(
-    grid: &Grid,
-    p: &TargetPhases<'_>,
-    fitted: &MapFit,
-    scattered: &[MapSample],
-    own: &[Option<[f64; 2]>],
-) -> Vec<[f64; 2]> {
-    let [nx, ny] = grid.map.nodes;
-    let pixel = |k: usize| grid.map.node_px(k % nx, k / nx);
-    let depth = depths(own, nx);
-    let deepest = (0..nx * ny).rev().max_by_key(|k| depth[*k]).unwrap_or(0);
-    let lags: Vec<[f64; 2]> = (0..=2 * FOLLOWED)
-        .map(|n| [0, 1].map(|i| correlation(p.directions[i].window, n * grid.step)))
-        .collect();
-    let influence = fitted.influence(pixel(deepest));
-    let near: Vec<(usize, usize, f64)> = scattered
-        .iter()
-        .filter_map(|s| {
-            let at = grid.map.nearest(s.pixel_px)?;
-            let (i, j) = (at % nx, at / nx);
-            let close = i.abs_diff(deepest % nx) <= FOLLOWED && j.abs_diff(deepest / nx) <= FOLLOWED;
-            close.then(|| (i, j, influence.weight(s) * s.sigma_px))
-        })
-        .collect();
-    let mut exact = [0.0; 2];
-    for (i, j, w) in &near {
-        for (k, l, v) in &near {
-            let (a, b) = (lags[i.abs_diff(*k)], lags[j.abs_diff(*l)]);
-            for d in 0..2 {
-                exact[d] += w * v * a[d] * b[d];
-            }
-        }
-    }
-    let typical = own[deepest].map_or(1.0, |s| (0.5 * (s[0] * s[0] + s[1] * s[1])).sqrt().max(1e-5));
-    let white = fitted.sigma_px(pixel(deepest)).unwrap_or(typical);
-    let shrunk = exact.map(|v| v.max(0.0).sqrt() / typical);
-    let widened = exact.map(|v| (v.max(0.0).sqrt() / white).max(1.0));
-    (0..nx * ny)
-        .map(|k| match own[k] {
-            Some(s) if depth[k] > 2 => [0, 1].map(|i| s[i] * shrunk[i]),
-            _ => {
-                let white = fitted.sigma_px(pixel(k)).unwrap_or(f64::NAN);
-                widened.map(|w| white * w)
-            }
-        })
-        .collect()
-}
-
-/// How many nodes away the nearest node without a phase or the border lies, up to 255.
-fn depths(own: &[Option<[f64; 2]>], nx: usize) -> Vec<u8> {
-    let ny = own.len() / nx;
-    let mut depth: Vec<u8> = own.iter().map(|o| if o.is_some() { 255 } else { 0 }).collect();
-    let step = |depth: &mut Vec<u8>, i: usize, j: usize, back: bool| {
-        let k = j * nx + i;
-        let beside = |inside: bool, k: usize, depth: &[u8]| if inside { depth[k] } else { 0 };
-        let (a, b) = if back {
-            (beside(i + 1 < nx, k + 1, depth), beside(j + 1 < ny, k + nx, depth))
-        } else {
-            (beside(i > 0, k.wrapping_sub(1), depth), beside(j > 0, k.wrapping_sub(nx), depth))
-        };
-        depth[k] = depth[k].min(a.min(b).saturating_add(1));
-    };
-    for j in 0..ny {
-        for i in 0..nx {
-            step(&mut depth, i, j, false);
-        }
-    }
-    for j in (0..ny).rev() {
-        for i in (0..nx).rev() {
-            step(&mut depth, i, j, true);
-        }
-    }
-    depth
 }
 
 /// What the windows take off the map beyond Brown's terms, at the measured nodes. (The analysis follows

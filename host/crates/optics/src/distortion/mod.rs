@@ -19,6 +19,7 @@
 mod brown;
 mod carrier;
 mod dense;
+mod noise;
 mod parts;
 
 use crate::camera::{Brown, Camera};
@@ -173,7 +174,7 @@ pub enum DistortionError {
     Optics(#[from] OpticsError),
     /// Hardly anything to calibrate from.
     #[error(
-        "only {found} places show both directions of lines, at least {needed} are needed: does the target fill the image, and are both images of it sharp?"
+        "only {found} places show both directions of lines, at least {needed} are needed: does the target reach well beyond the analysis window (ten line distances by default), and are both images of it sharp?"
     )]
     TooFew {
         /// Places found.
@@ -214,9 +215,12 @@ pub enum DistortionError {
 pub struct DistortionCalibration {
     /// e over the target.
     pub map: DistortionMap,
-    /// Standard deviation of (e_x, e_y) at the map's nodes from image noise, row by row, pixels. Where
-    /// [`measured`](Self::measured) is false it also holds how far the map may stray.
+    /// Standard deviation of (e_x, e_y) at the map's nodes, row by row, pixels: from image noise, and how far the
+    /// true distortion may stray from a smooth map between and beyond the nodes that were
+    /// [`measured`](Self::measured).
     pub sigma_px: Vec<[f64; 2]>,
+    /// The part from image noise: the scatter of the map over repeated exposures.
+    pub noise_px: Vec<[f64; 2]>,
     /// Nodes at which phases were measured; elsewhere (the border that the window leaves, gaps) the map
     /// goes on smoothly from Brown's terms.
     pub measured: Vec<bool>,
@@ -246,7 +250,8 @@ pub struct DistortionCalibration {
 /// The error of a map, in parts; RMS over the measured nodes, pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Left {
-    /// Measured less map at places half-way between the nodes, which the map was not made from.
+    /// Measured less map at places half-way between the nodes, which the map was not made from, beyond what
+    /// noise makes of that difference.
     pub between_nodes_px: [f64; 2],
     /// Standard deviation of the map from image noise.
     pub noise_px: [f64; 2],
@@ -258,13 +263,6 @@ impl Left {
     /// All together.
     pub fn total_px(&self) -> [f64; 2] {
         [0, 1].map(|i| self.between_nodes_px[i].hypot(self.noise_px[i]).hypot(self.window_px[i]))
-    }
-}
-
-impl DistortionCalibration {
-    /// Standard deviation of (e_x, e_y) at a pixel, from the nearest node; nothing outside the map.
-    pub fn sigma_at_px(&self, pixel_px: [f64; 2]) -> Option<[f64; 2]> {
-        self.map.grid().nearest(pixel_px).map(|k| self.sigma_px[k])
     }
 }
 
@@ -291,7 +289,7 @@ pub fn calibrate_distortion(
     }
     let only = fit(&nodes, &prediction, start, base, [false; 5])?;
     let brown = brown::fit_beside(&grid, &samples, &prediction, &only)?;
-    let made = dense::make(&grid, phases, &samples, &prediction, &only, &brown.e_px)?;
+    let made = dense::make(&grid, phases, &samples, &prediction, &only, &brown)?;
     let pitch = only.carrier.pitch();
     let mut warnings = Vec::new();
     if grid.share < COVERED {
@@ -308,6 +306,7 @@ pub fn calibrate_distortion(
     Ok(DistortionCalibration {
         map: made.map,
         sigma_px: made.sigma,
+        noise_px: made.noise,
         measured: made.measured,
         brown,
         pose: phases.pose,
