@@ -77,7 +77,7 @@ fn left_edge(scene: &Scene, view: View) -> [f64; 2] {
 }
 
 /// A source of width Δλ smears each view. For rays that leave the grating along its normal that is z Δλ/(p c³)
-/// (EQUATIONS 1d), 2.84 px for 2 nm; the specimen below the axis is seen at 8° instead of 10.95°, and 2.79 px wide.
+/// (2.84 px for 2 nm); the specimen below the axis is seen at 8° instead of 10.95°, and 2.79 px wide.
 /// Expected is therefore the variance of the places where the grating equation puts the edge, over the spectrum.
 #[test]
 fn the_spectrum_smears_the_views() {

@@ -23,6 +23,7 @@ fn options(images: Vec<PathBuf>, out: &Path) -> Options {
         region: None,
         ideal: None,
         one_pose: false,
+        square: false,
         target_pitch_mm: None,
         phase: phase_settings(),
         out: out.join("out"),
@@ -336,6 +337,7 @@ fn maps_through_the_grating_serve_either_decoder() {
         ideal,
         optics: optics.then(|| plain_path.clone()),
         one_pose: true,
+        square: false,
         target_pitch_mm: optics.then_some(PITCH_MM),
         ..options(frames.clone(), folder.path())
     };

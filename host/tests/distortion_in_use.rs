@@ -14,6 +14,8 @@ use target::{Lines, Noise, brightness, grey, save};
 
 const SIZE: [usize; 2] = [640, 480];
 const PITCH_MM: f64 = 0.9;
+/// Half of the speckled plate.
+const HALF_MM: [f64; 2] = [8.5, 9.0];
 
 fn daic(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_daic")).args(arguments).output().unwrap()
@@ -58,6 +60,10 @@ fn speckle(model: &OpticalModel) -> Vec<f64> {
             .map(|k| {
                 let o = [(from + k % (SIZE[0] / 2)) as f64, (k / (SIZE[0] / 2)) as f64];
                 let p = model.point_at_height(view, o, 0.0).unwrap();
+                // the plate stands before a dark background
+                if p.x.abs() > HALF_MM[0] || p.y.abs() > HALF_MM[1] {
+                    return 0.02;
+                }
                 let sum: f64 = waves.iter().map(|[a, b, c]| (TAU * (a * p.x + b * p.y + c)).cos()).sum();
                 0.5 + 0.06 * sum
             })
@@ -119,7 +125,8 @@ fn maps_through_the_grating_flatten_a_plate() {
             "distortion",
             text(&path("x.png")),
             text(&path("y.png")),
-            "--one-pose",
+            // in the reference plane: what looks like its tilt is the grating's perspective
+            "--square",
             "--ideal",
             "pinhole",
             "--view",
@@ -137,8 +144,9 @@ fn maps_through_the_grating_flatten_a_plate() {
     assert!(named.starts_with(comment) && named.contains("file = \"minus/distortion.json\""), "{named}");
     let after = profile("with");
     println!("flat plate by `linear`: {before:.1} µm RMS without maps, {after:.1} µm with");
-    // Without maps the bowl of the virtual object; with them the correlation's noise and the removed terms.
-    assert!(before > 30.0 && after < 0.2 * before, "{before} {after}");
+    // Without maps the bowl of the virtual object, 12.6; with them 2.3, of which 0.96 are the match's noise and 0.69 the
+    // maps'.
+    assert!(before > 12.0 && after < 2.5, "{before} {after}");
 
     // A map of the whole sensor would count twice what the views' maps hold, and the other way round.
     let out = path("sensor");

@@ -45,6 +45,8 @@ pub struct Options {
     pub ideal: Option<IdealImage>,
     /// Both images show the target in one plane.
     pub one_pose: bool,
+    /// The target lies square to the camera, or in the reference plane: nothing of a tilt is removed.
+    pub square: bool,
     /// Line distance of the target, mm, to check the scale by.
     pub target_pitch_mm: Option<f64>,
     /// How the phases are found.
@@ -135,7 +137,11 @@ pub fn calibrate(options: &Options) -> Result<Outcome, Error> {
         })?);
     }
     let directions = directions(&phases);
-    let pose = if frames.len() == 1 || options.one_pose { TargetPose::Common } else { TargetPose::Separate };
+    let pose = match (options.square, frames.len() == 1 || options.one_pose) {
+        (true, _) => TargetPose::Square,
+        (false, true) => TargetPose::Common,
+        (false, false) => TargetPose::Separate,
+    };
     let target = TargetPhases {
         width: region.width,
         height: region.height,

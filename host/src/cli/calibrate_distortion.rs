@@ -34,6 +34,9 @@ pub struct DistortionArgs {
     /// Both images show the target in one plane (it was turned on its holder): fewer terms are left open
     #[arg(long)]
     one_pose: bool,
+    /// The target lies square to the camera, or in the reference plane of the set-up: nothing of a tilt is removed
+    #[arg(long, conflicts_with = "one_pose")]
+    square: bool,
     /// Distance of the target's lines, to check the scale by (with --optics)
     #[arg(long, value_name = "MM", value_parser = positive)]
     target_pitch: Option<f64>,
@@ -89,6 +92,7 @@ pub fn calibrate(arguments: &DistortionArgs, output: &Output) -> Result<Answer, 
             IdealArg::Ray => IdealImage::Ray,
         }),
         one_pose: arguments.one_pose,
+        square: arguments.square,
         target_pitch_mm: arguments.target_pitch,
         phase,
         out: arguments.out.clone(),

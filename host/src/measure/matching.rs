@@ -372,6 +372,8 @@ fn disparity(
     view: &Rectangle,
     height_mm: [f64; 2],
 ) -> Result<([f64; 2], [f64; 2]), Error> {
+    // distortion is small against the margins; and maps end where they were measured, the search may go beyond
+    let model = OpticalModel::new(model.optics())?;
     let (left, top) = (view.x as f64, view.y as f64);
     let (right, bottom) = (left + view.width as f64, top + view.height as f64);
     let (mut u, mut v) = ((f64::INFINITY, f64::NEG_INFINITY), (f64::INFINITY, f64::NEG_INFINITY));

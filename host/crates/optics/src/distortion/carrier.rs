@@ -157,7 +157,12 @@ impl Carrier {
             |i: usize, j: usize| mean(&|s| (s.0[i] - centre[i]) * (s.0[j] - centre[j]) / (scale * scale));
         let m = [[product(0, 0), product(0, 1)], [product(0, 1), product(1, 1)]];
         let mut turns_scale = [1.0; 2];
-        let mut h = vec![0.0; if pose == TargetPose::Common { 8 } else { 10 }];
+        let terms = match pose {
+            TargetPose::Square => 6,
+            TargetPose::Common => 8,
+            TargetPose::Separate => 10,
+        };
+        let mut h = vec![0.0; terms];
         for k in 0..2 {
             let r = [0, 1].map(|i| mean(&|s| (s.0[i] - centre[i]) / scale * (s.1[k] - turns_centre[k])));
             let slope = solve2(m, r).ok_or_else(|| undetermined.clone())?;
@@ -172,17 +177,27 @@ impl Carrier {
         Ok(Self { centre, scale, turns_centre, turns_scale, h })
     }
 
-    /// Places of the two denominators.
-    fn denominators(&self) -> [usize; 2] {
-        if self.h.len() == 8 { [6, 6] } else { [6, 8] }
+    /// Places of the two denominators; none without tilt.
+    fn denominators(&self) -> Option<[usize; 2]> {
+        match self.h.len() {
+            6 => None,
+            8 => Some([6, 6]),
+            _ => Some([6, 8]),
+        }
+    }
+
+    /// Coefficients of x and y in the denominator of phase k.
+    fn denominator(&self, k: usize) -> [f64; 2] {
+        self.denominators().map_or([0.0; 2], |den| [self.h[den[k]], self.h[den[k] + 1]])
     }
 
     /// Coordinates on the plane from both phases; A⁻¹ for scaled coordinates.
     fn plane(&self, turns: [f64; 2]) -> Option<(Pair, Pair, [Pair; 2])> {
         let t = [0, 1].map(|k| (turns[k] - self.turns_centre[k]) / self.turns_scale[k]);
-        let den = self.denominators();
-        let a = [0, 1]
-            .map(|k| [self.h[3 * k] - t[k] * self.h[den[k]], self.h[3 * k + 1] - t[k] * self.h[den[k] + 1]]);
+        let a = [0, 1].map(|k| {
+            let den = self.denominator(k);
+            [self.h[3 * k] - t[k] * den[0], self.h[3 * k + 1] - t[k] * den[1]]
+        });
         let q = solve2(a, [0, 1].map(|k| t[k] - self.h[3 * k + 2]))?;
         let first = solve2(a, [1.0, 0.0])?;
         let second = solve2(a, [0.0, 1.0])?;
@@ -192,10 +207,10 @@ impl Carrier {
     /// Phases of a place on the plane, turns.
     pub(super) fn turns(&self, plane: [f64; 2]) -> [f64; 2] {
         let [x, y] = [0, 1].map(|i| (plane[i] - self.centre[i]) / self.scale);
-        let den = self.denominators();
         [0, 1].map(|k| {
+            let den = self.denominator(k);
             let n = self.h[3 * k] * x + self.h[3 * k + 1] * y + self.h[3 * k + 2];
-            let d = 1.0 + self.h[den[k]] * x + self.h[den[k] + 1] * y;
+            let d = 1.0 + den[0] * x + den[1] * y;
             self.turns_centre[k] + self.turns_scale[k] * n / d
         })
     }
@@ -223,8 +238,10 @@ impl Carrier {
                 for (j, v) in [q[0], q[1], 1.0].into_iter().enumerate() {
                     by_carrier[i][3 * k + j] += m[i][k] * v;
                 }
-                for j in 0..2 {
-                    by_carrier[i][den[k] + j] -= m[i][k] * t[k] * q[j];
+                if let Some(den) = den {
+                    for j in 0..2 {
+                        by_carrier[i][den[k] + j] -= m[i][k] * t[k] * q[j];
+                    }
                 }
             }
         }
@@ -243,8 +260,8 @@ impl Carrier {
     }
 
     fn gradient(&self, k: usize) -> [f64; 2] {
-        let den = self.denominators()[k];
-        [0, 1].map(|j| self.h[3 * k + j] - self.h[3 * k + 2] * self.h[den + j])
+        let den = self.denominator(k);
+        [0, 1].map(|j| self.h[3 * k + j] - self.h[3 * k + 2] * den[j])
     }
 
     /// Angle of the normals of the lines against x, radians.
@@ -254,7 +271,7 @@ impl Carrier {
 
     /// How the inverse distance to the plane changes along x and y, per unit of the plane.
     pub(super) fn tilt(&self) -> [[f64; 2]; 2] {
-        self.denominators().map(|d| [self.h[d] / self.scale, self.h[d + 1] / self.scale])
+        [0, 1].map(|k| self.denominator(k).map(|d| d / self.scale))
     }
 }
 

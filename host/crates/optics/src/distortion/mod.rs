@@ -69,6 +69,10 @@ pub enum TargetPose {
     /// One pose: a cross grating, or two exposures on a holder that keeps the plane. Not determined:
     /// 1, x, y of e_x and of e_y; (x², xy) and (xy, y²) of e_x and e_y in common.
     Common,
+    /// The target is known to lie square to the camera, or in the reference plane of a set-up: nothing of a tilt is
+    /// removed. Not determined: 1, x, y of e_x and of e_y. Through a grating and counted from straight lines this keeps
+    /// what the paraxial models take the grating's own perspective for.
+    Square,
     /// Each direction has a pose of its own. Not determined: 1, x, y, x², xy of e_x;
     /// 1, x, y, xy, y² of e_y.
     Separate,
@@ -78,6 +82,7 @@ impl TargetPose {
     /// The terms that are removed with the carrier: of e_x alone, of e_y alone, and of both in common.
     pub fn removed(self) -> [&'static [&'static str]; 3] {
         match self {
+            Self::Square => [&["1", "x", "y"], &["1", "x", "y"], &[]],
             Self::Common => [&["1", "x", "y"], &["1", "x", "y"], &["(x², xy)", "(xy, y²)"]],
             Self::Separate => [&["1", "x", "y", "x²", "xy"], &["1", "x", "y", "xy", "y²"], &[]],
         }
@@ -86,6 +91,7 @@ impl TargetPose {
     /// The terms among them that a tilt makes: of e_x, of e_y, and of both in common.
     pub fn shared_with_tilt(self) -> [&'static [&'static str]; 3] {
         match self {
+            Self::Square => [&[], &[], &[]],
             Self::Common => [&[], &[], &["(x², xy)", "(xy, y²)"]],
             Self::Separate => [&["x², xy"], &["xy, y²"], &[]],
         }
