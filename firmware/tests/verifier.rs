@@ -79,15 +79,18 @@ fn single_instructions() {
         u32::MAX.into(),
         1_000_000_000,
     );
-    refused(&[full_move(1, 0, 1, 1, 5)], 0, Rule::Unsupported, 5, 0);
+    let unsupported = |i: Instruction, value| {
+        let expected = Violation { instruction: 0, rule: Rule::Unsupported, value, limit: 0 };
+        assert_eq!(verdict(&[i], &bare_board()), Err(expected));
+    };
+    unsupported(full_move(1, 0, 1, 1, 5), 5);
     let wait = Instruction::WaitTrigger { input: 0, edge: TriggerEdge::Rising, skip: 0, timeout: 0 };
-    refused(&[wait], 0, Rule::Unsupported, 0, 0);
-    // A board cannot promise more than the firmware plays.
+    unsupported(wait, 0);
+    accepted(&[wait, full_move(1, 0, 1, 1, 5)]);
     let mut board = small_board();
-    board.capabilities = u32::MAX;
     board.axes[0].max_rate = u32::MAX;
-    assert_eq!(verdict(&[wait], &board).unwrap_err().rule, Rule::Unsupported);
-    assert_eq!(verdict(&[full_move(0, 0, 1, 1, 5)], &board).unwrap_err().rule, Rule::Unsupported);
+    board.axes[0].max_jerk = 4;
+    assert_eq!(verdict(&[full_move(0, 0, 1, 1, 5)], &board).unwrap_err().rule, Rule::JerkOutOfRange);
     let limit = i64::from(daic_firmware::motion::MAX_STEP_RATE);
     assert_eq!(verdict(&[full_move(0, 0, 250_001, 1, 0)], &board).unwrap_err().limit, limit);
 }
