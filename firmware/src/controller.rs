@@ -186,9 +186,10 @@ impl Controller {
     /// The input word (see [`channels`](daic_protocol::channels)) is `word` from tick `tick` on. Changes come
     /// in order of ticks. Everything due by then is played first.
     pub fn inputs(&mut self, tick: u64, word: u32, sink: &mut dyn Sink) {
-        // An output due at the tick of the change is played before it.
+        // An output due at the tick of the change comes before it; a trigger that comes at the last tick of
+        // a wait still counts.
         let tick = tick.max(self.out.inputs.known);
-        self.play(tick, sink);
+        self.play_ahead(tick, tick.saturating_sub(1), sink);
         let before = self.out.inputs.word;
         let changed = before ^ word;
         if changed == 0 {
@@ -518,9 +519,10 @@ impl Controller {
     fn slot_load(&mut self, slot: u8, sink: &mut dyn Sink) -> Result<(), Refusal> {
         match self.state {
             State::Empty | State::Loaded => {
-                let mut program = ProgramBytes::new();
-                sink.fetch(slot, &mut program).map_err(|error| Refusal::Slot { slot, error })?;
-                self.loader.take(&program, &self.board)?;
+                let fetch = |program: &mut ProgramBytes| {
+                    sink.fetch(slot, program).map_err(|error| Refusal::Slot { slot, error })
+                };
+                self.loader.take(&self.board, fetch)?;
                 self.state = State::Loaded;
                 Ok(())
             }
@@ -612,7 +614,7 @@ impl Controller {
 
     fn stop(&mut self) -> Result<(), Refusal> {
         match (self.state, &mut self.player) {
-            (State::Running, Some((player, _))) => player.stop(),
+            (State::Running, Some((player, _))) => player.stop(self.now),
             (State::Armed, _) => self.disarm(),
             _ => return self.wrong_state(),
         }

@@ -21,7 +21,7 @@ pub trait LevelDriver {
 /// ⌊level · top / 65 535⌋.
 fn scale(level: u16, top: u16) -> u16 {
     let product = u32::from(level).saturating_mul(u32::from(top));
-    u16::try_from(product / u32::from(u16::MAX)).unwrap_or(top)
+    u16::try_from(product / 0xffff).unwrap_or(top)
 }
 
 /// One PWM output per LED.

@@ -85,11 +85,19 @@ impl Loader {
         self.stream.as_ref().map(|s| s.state(played)).ok_or(Refusal::NotStreaming)
     }
 
-    /// Takes a program from elsewhere, verified as at commit.
-    pub(crate) fn take(&mut self, program: &ProgramBytes, board: &Board) -> Result<(), Refusal> {
-        verifier::verify(program, board).map_err(Refusal::Invalid)?;
-        self.live.clone_from(program);
+    /// Takes a program from elsewhere, verified as at commit; what was staged is dropped.
+    pub(crate) fn take(
+        &mut self,
+        board: &Board,
+        fetch: impl FnOnce(&mut ProgramBytes) -> Result<(), Refusal>,
+    ) -> Result<(), Refusal> {
+        (self.staging, self.stream) = (None, None);
+        self.staged.clear();
+        fetch(&mut self.staged)?;
+        verifier::verify(&self.staged, board).map_err(Refusal::Invalid)?;
+        core::mem::swap(&mut self.live, &mut self.staged);
         self.hash = Some(program::hash(&self.live));
+        self.staged.clear();
         Ok(())
     }
 

@@ -144,10 +144,10 @@ fn a_policy_may_finish_the_move() {
     let mut rig = Rig::new(interlocked());
     rig.input(rig.now, INTERLOCK);
     let start = rig.start(&[Instruction::Policy(policy), edge(0x100, 0x100, 0), go(0, 40), edge(0x100, 0, 9)]);
-    rig.play_to(start + 100_000);
+    rig.play_to(start + 800_000);
     let before = rig.controller.position()[0];
     assert!((1..39).contains(&before), "{before}");
-    rig.input(start + 100_001, 0);
+    rig.input(start + 800_001, 0);
     assert_eq!(rig.controller.word() & 0x100, 0, "what is not a move is off at once");
     assert_eq!(rig.controller.state(), State::Running);
     rig.finish();

@@ -11,8 +11,7 @@ mod trigger;
 pub(crate) use homing::{SHORTEST as SHORTEST_HOMING, longest as longest_homing};
 use homing::{Found, Search};
 use motion::{Motion, Pace, Target};
-pub(crate) use trigger::is_open;
-use trigger::{Gate, Wait};
+use trigger::{Gate, Wait, is_open};
 
 use crate::Sink;
 use crate::board::Board;
@@ -156,11 +155,6 @@ impl Player {
         self.index
     }
 
-    /// Instructions begun.
-    pub(crate) fn begun(&self) -> u32 {
-        self.begun
-    }
-
     /// Ticks waited up to tick `now` beyond the shortest time the program can take.
     pub(crate) fn waited(&self, now: u64) -> u64 {
         let current = match &self.current {
@@ -170,13 +164,14 @@ impl Player {
         self.waited.saturating_add(current)
     }
 
-    pub(crate) fn stop(&mut self) {
+    /// End after the current instruction; a wait that nothing has ended yet ends now.
+    pub(crate) fn stop(&mut self, now: u64) {
         self.stopping = true;
         // A wait would never end by itself.
         if let Current::Trigger(wait) = self.current
             && wait.fired.is_none()
         {
-            self.finish(wait.since);
+            self.finish(wait.since.max(now));
         }
     }
 
@@ -268,7 +263,7 @@ impl Player {
             let done = if is_step {
                 self.step(tick, stage)
             } else {
-                self.act(tick, until, known, &mut source, stage)
+                self.act(tick, known, &mut source, stage)
             };
             match done {
                 Some(Progress::Waiting) => {}
@@ -368,7 +363,6 @@ impl Player {
     fn act(
         &mut self,
         tick: u64,
-        until: u64,
         known: u64,
         source: &mut Source<'_>,
         stage: &mut Stage<'_>,
@@ -405,10 +399,6 @@ impl Player {
             }
             Current::Trigger(wait) => return self.triggered(tick, wait, stage),
             Current::Home(mut search) => {
-                let tick = stage.out.earliest(tick);
-                if tick > until {
-                    return Some(Progress::Waiting);
-                }
                 match search.advance(tick, stage.out, stage.sink)? {
                     Found::Searching => self.current = Current::Home(search),
                     Found::Home(tick) => self.finish(tick),

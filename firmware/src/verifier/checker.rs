@@ -216,8 +216,8 @@ impl Checker {
             Instruction::Gate { .. }
             | Instruction::NoGate
             | Instruction::Policy(_)
-            | Instruction::Mark { .. }
-            | Instruction::Stop => Ok(()),
+            | Instruction::Mark { .. } => Ok(()),
+            Instruction::Stop => self.end(index),
         }
     }
 

@@ -95,8 +95,6 @@ struct Verifier<'a> {
     joined: heapless::Vec<(u8, i32), AXES>,
     /// Nothing was rounded to the safe side so far.
     exact: bool,
-    /// Something depends on inputs or on where the stage stands.
-    uncertain: bool,
     /// A `Stop` has been reached: what follows is not played.
     ended: bool,
 }
@@ -137,7 +135,6 @@ impl<'a> Verifier<'a> {
             positions: anywhere(board),
             joined: heapless::Vec::new(),
             exact,
-            uncertain: false,
             ended: false,
         }
     }
@@ -160,7 +157,7 @@ impl<'a> Verifier<'a> {
     }
 
     /// Finds out what a program does that could not be proven.
-    fn decide(&mut self, program: &[u8], found: Violation) -> Result<(), Violation> {
+    fn decide(&self, program: &[u8], found: Violation) -> Result<(), Violation> {
         // Its structure must be sound to the end.
         structure(program, self.board)?;
         let all = anywhere(self.board);
@@ -177,7 +174,7 @@ impl<'a> Verifier<'a> {
                 }
             }
         }
-        if clean && !self.uncertain {
+        if clean && !is_uncertain(program) {
             return Ok(());
         }
         Err(violation(found.instruction, Rule::CannotProve, found.rule as i64, i64::from(MAX_PLAYED)))
@@ -300,7 +297,7 @@ impl<'a> Verifier<'a> {
 
     /// From here on something is rounded to the safe side.
     fn guess(&mut self) {
-        (self.exact, self.uncertain) = (false, true);
+        self.exact = false;
     }
 
     fn moving(
@@ -415,6 +412,15 @@ impl<'a> Verifier<'a> {
         }
         if self.ended { Ok(()) } else { self.check_end(last) }
     }
+}
+
+/// Whether what a program does depends on inputs or on where the stage stands.
+fn is_uncertain(program: &[u8]) -> bool {
+    decode(program).any(|(_, instruction)| match instruction {
+        Ok(Instruction::Wait { .. } | Instruction::WaitTrigger { .. } | Instruction::Home { .. }) => true,
+        Ok(other) => rules::pace_of(&other).is_some(),
+        Err(_) => true,
+    })
 }
 
 /// Any place between the limits, and where every axis is at boot.

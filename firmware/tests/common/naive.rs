@@ -453,6 +453,11 @@ pub fn play_with(
     p.play(program);
     if p.word & 0xffff != 0 {
         p.broke(Rule::LeftOn);
+        // A light that is left on owes what it owes.
+        let (now, lit) = (p.now, p.word & 0xff);
+        p.word &= !lit;
+        p.light(now);
+        p.word |= lit;
     }
     p.merge();
     let mut end = p.now;
