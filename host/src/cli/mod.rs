@@ -9,6 +9,7 @@ mod commands;
 mod microscope;
 mod output;
 mod plan;
+mod rig;
 mod strain;
 
 use arguments::{Cli, Command};
@@ -67,6 +68,7 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Init(arguments) => commands::init(arguments),
         Command::Schema => commands::schema(),
         Command::Doctor(arguments) => commands::doctor(arguments),
+        Command::Rig(arguments) => rig::run(arguments, output),
     }
 }
 
