@@ -79,9 +79,7 @@ impl LedLimits {
     /// Longest pulse and cost of a tick of light at `level`.
     pub fn at(&self, level: u16) -> (u32, u32) {
         let rows = self.overdrive.iter().filter(|row| level > row.above);
-        rows.fold((self.max_pulse, 1), |(pulse, cycle), row| {
-            (pulse.min(row.max_pulse), cycle.max(row.cycle))
-        })
+        rows.fold((self.max_pulse, 1), |(pulse, cycle), row| (pulse.min(row.max_pulse), cycle.max(row.cycle)))
     }
 }
 

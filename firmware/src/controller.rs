@@ -233,8 +233,7 @@ impl Controller {
         match (&mut self.player, self.state) {
             (Some((player, _)), _) => {
                 let reaction = player.policy().interlock;
-                let mut stage =
-                    Stage { board: &self.board, out: &mut self.out, sink, host: self.host };
+                let mut stage = Stage { board: &self.board, out: &mut self.out, sink, host: self.host };
                 let progress = player.react(tick, FaultCause::Interlock, reaction, &mut stage);
                 self.conclude(progress, sink);
             }
@@ -492,12 +491,7 @@ impl Controller {
 
     fn input_counts(&self) -> Inputs {
         let inputs = &self.out.inputs;
-        Inputs {
-            word: inputs.word,
-            rising: inputs.rising,
-            missed: inputs.missed,
-            homed: self.out.homed(),
-        }
+        Inputs { word: inputs.word, rising: inputs.rising, missed: inputs.missed, homed: self.out.homed() }
     }
 
     fn self_test(&self, sink: &mut dyn Sink) -> Reply {

@@ -54,7 +54,8 @@ impl Lamp {
         let since = self.since?;
         let by_pulse = since.saturating_add(self.max_pulse);
         let left = self.window.saturating_sub(self.owed);
-        let by_duty = left.checked_div(self.cycle.saturating_sub(1)).map(|ticks| self.at.saturating_add(ticks));
+        let by_duty =
+            left.checked_div(self.cycle.saturating_sub(1)).map(|ticks| self.at.saturating_add(ticks));
         Some(by_duty.map_or(by_pulse, |t| t.min(by_pulse)))
     }
 }

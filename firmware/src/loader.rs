@@ -24,7 +24,13 @@ pub(crate) struct Loader {
 
 impl Loader {
     pub(crate) const fn new() -> Self {
-        Self { live: ProgramBytes::new(), hash: None, staged: ProgramBytes::new(), staging: None, stream: None }
+        Self {
+            live: ProgramBytes::new(),
+            hash: None,
+            staged: ProgramBytes::new(),
+            staging: None,
+            stream: None,
+        }
     }
 
     /// Hash of the committed program.

@@ -15,14 +15,7 @@ fn motion() -> bool {
 }
 
 fn verifier() -> bool {
-    let axis = AxisLimits {
-        min: 0,
-        max: 1,
-        max_rate: 1,
-        max_acceleration: 1,
-        max_jerk: 0,
-        home: None,
-    };
+    let axis = AxisLimits { min: 0, max: 1, max_rate: 1, max_acceleration: 1, max_jerk: 0, home: None };
     let board = Board {
         name: "",
         capabilities: 0,

@@ -143,7 +143,8 @@ fn a_policy_may_finish_the_move() {
     let policy = Policy { interlock: Reaction::FinishMove, ..Policy::DEFAULT };
     let mut rig = Rig::new(interlocked());
     rig.input(rig.now, INTERLOCK);
-    let start = rig.start(&[Instruction::Policy(policy), edge(0x100, 0x100, 0), go(0, 40), edge(0x100, 0, 9)]);
+    let start =
+        rig.start(&[Instruction::Policy(policy), edge(0x100, 0x100, 0), go(0, 40), edge(0x100, 0, 9)]);
     rig.play_to(start + 800_000);
     let before = rig.controller.position()[0];
     assert!((1..39).contains(&before), "{before}");
@@ -160,7 +161,12 @@ fn a_policy_may_finish_the_move() {
 fn a_lost_host_is_noticed_to_the_tick() {
     let policy = Policy { host_timeout_ms: 10, host_loss: Reaction::Safe, ..Policy::DEFAULT };
     let mut rig = Rig::new(small_board());
-    let start = rig.start(&[Instruction::Policy(policy), edge(0x100, 0x100, 0), delay(10_000_000), edge(0x100, 0, 9)]);
+    let start = rig.start(&[
+        Instruction::Policy(policy),
+        edge(0x100, 0x100, 0),
+        delay(10_000_000),
+        edge(0x100, 0, 9),
+    ]);
     let heard = rig.now;
     rig.play_to(start + 500_000);
     // Any request is a sign of life.
@@ -277,7 +283,8 @@ fn exposures_are_stamped_and_compared_with_their_triggers() {
     }
     rig.finish();
     let kinds: Vec<_> = rig.events().iter().map(|e| (e.tick - start, e.kind)).collect();
-    let of = |wanted: fn(&EventKind) -> bool| kinds.iter().filter(|k| wanted(&k.1)).copied().collect::<Vec<_>>();
+    let of =
+        |wanted: fn(&EventKind) -> bool| kinds.iter().filter(|k| wanted(&k.1)).copied().collect::<Vec<_>>();
     assert_eq!(
         of(|k| matches!(k, EventKind::ExposureBegan { .. })),
         [
@@ -363,13 +370,17 @@ fn bad_waits_are_refused() {
     refused(Instruction::Policy(Policy { underrun: Reaction::Continue, ..Policy::DEFAULT }), Rule::BadPolicy);
     refused(Instruction::Join { axis: 0, target: 0 }, Rule::BadJoin);
     refused(Instruction::Reach, Rule::NothingToReach);
-    refused(Instruction::Go { axis: 0, target: 1, max_rate: 1, acceleration: 1, jerk: 0 }, Rule::MoveNotEnded);
+    refused(
+        Instruction::Go { axis: 0, target: 1, max_rate: 1, acceleration: 1, jerk: 0 },
+        Rule::MoveNotEnded,
+    );
 }
 
 /// An LED must not shine across a wait that has no end.
 #[test]
 fn light_across_a_wait() {
-    let program = |timeout| [edge(1, 1, 4), wait(Condition::Rising, 0, 20, timeout, Timeout::Fault), edge(1, 0, 4)];
+    let program =
+        |timeout| [edge(1, 1, 4), wait(Condition::Rising, 0, 20, timeout, Timeout::Fault), edge(1, 0, 4)];
     let verdict = |timeout| {
         let bytes = daic_protocol::program::encode(&program(timeout)).unwrap();
         daic_firmware::verifier::verify(&bytes, &small_board())

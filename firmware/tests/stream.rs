@@ -59,9 +59,8 @@ fn stream(rig: &mut Rig, bytes: &[u8], pace: u64) -> (u64, StreamState) {
 #[test]
 fn a_program_longer_than_memory() {
     // 10 000 edges, 60 kB.
-    let list: Vec<_> = (0..10_000u32)
-        .map(|i| edge(0x100, if i % 2 == 0 { 0x100 } else { 0 }, 20_000 + i % 7))
-        .collect();
+    let list: Vec<_> =
+        (0..10_000u32).map(|i| edge(0x100, if i % 2 == 0 { 0x100 } else { 0 }, 20_000 + i % 7)).collect();
     let bytes = encode(&list);
     assert!(bytes.len() > 3 * STREAM_BYTES);
     let mut rig = Rig::new(small_board());
@@ -92,7 +91,10 @@ fn an_under_run_is_safe_and_told() {
     assert_eq!(rig.out.words, [(start + 10, 1), (start + 60, 0), (start + 70, 0x100), (start + 74, 0)]);
     let fault = rig.controller.fault().unwrap();
     assert_eq!((fault.cause, fault.tick, fault.instruction), (FaultCause::Underrun, start + 74, 2));
-    assert_eq!(rig.refused(Request::StreamWrite { offset: 0, data: Default::default() }), Refusal::NotStreaming);
+    assert_eq!(
+        rig.refused(Request::StreamWrite { offset: 0, data: Default::default() }),
+        Refusal::NotStreaming
+    );
     assert_eq!(rig.done(Request::ClearFault), State::Empty);
 }
 
@@ -106,10 +108,7 @@ fn repeats_do_no_harm_and_gaps_are_refused() {
     let first = state(write(&mut rig, 0, &bytes[..5]));
     assert_eq!(first.received, 5);
     assert_eq!(state(write(&mut rig, 0, &bytes[..5])), first);
-    assert_eq!(
-        write(&mut rig, 6, &bytes[6..]),
-        Reply::Refused(Refusal::StreamGap { expected: 5, given: 6 })
-    );
+    assert_eq!(write(&mut rig, 6, &bytes[6..]), Reply::Refused(Refusal::StreamGap { expected: 5, given: 6 }));
     // An overlap brings what is new.
     assert_eq!(state(write(&mut rig, 3, &bytes[3..])).received, bytes.len() as u32);
     let length = bytes.len() as u32;
@@ -118,10 +117,7 @@ fn repeats_do_no_harm_and_gaps_are_refused() {
     let short = Request::StreamEnd { length: 3, hash: 1 };
     assert_eq!(rig.refused(short), Refusal::LengthDiffers { begun: length, committed: 3 });
     assert!(state(rig.ask(Request::StreamEnd { length, hash: hash(&bytes) })).ended);
-    assert_eq!(
-        write(&mut rig, length, &bytes),
-        Reply::Refused(Refusal::StreamEnded { length })
-    );
+    assert_eq!(write(&mut rig, length, &bytes), Reply::Refused(Refusal::StreamEnded { length }));
     rig.done(Request::Start);
     rig.finish();
     assert_eq!(rig.out.words.len(), 2);

@@ -240,11 +240,7 @@ fn causes() -> Vec<(FaultCause, &'static str)> {
 }
 
 fn autostarts() -> Vec<(Autostart, &'static str)> {
-    vec![
-        (Autostart::Off, "00"),
-        (Autostart::PowerUp, "01"),
-        (Autostart::Input { input: 1 }, "02 01"),
-    ]
+    vec![(Autostart::Off, "00"), (Autostart::PowerUp, "01"), (Autostart::Input { input: 1 }, "02 01")]
 }
 
 fn slot_errors() -> Vec<(SlotError, &'static str)> {

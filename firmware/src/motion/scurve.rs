@@ -171,10 +171,7 @@ impl SCurve {
         let scaled = u128::from(x).checked_shl(self.shift).unwrap_or(0);
         let width = u128::from(width.max(1));
         let narrow = |x: u128| u64::try_from(x).unwrap_or(u64::MAX);
-        (
-            narrow(scaled.checked_div(width).unwrap_or(0)),
-            narrow(scaled.checked_rem(width).unwrap_or(0)),
-        )
+        (narrow(scaled.checked_div(width).unwrap_or(0)), narrow(scaled.checked_rem(width).unwrap_or(0)))
     }
 }
 
@@ -198,8 +195,7 @@ pub struct SCurveSteps {
 impl SCurveSteps {
     /// Begins with the first step.
     pub fn new(curve: SCurve) -> Self {
-        let mut steps =
-            Self { curve, done: 0, slice: 0, begin: 0, width: 0, last: None, interval: (0, 0) };
+        let mut steps = Self { curve, done: 0, slice: 0, begin: 0, width: 0, last: None, interval: (0, 0) };
         steps.width = steps.end_of(0);
         steps
     }

@@ -8,8 +8,8 @@ mod homing;
 mod motion;
 mod trigger;
 
-pub(crate) use homing::{SHORTEST as SHORTEST_HOMING, longest as longest_homing};
 use homing::{Found, Search};
+pub(crate) use homing::{SHORTEST as SHORTEST_HOMING, longest as longest_homing};
 use motion::{Motion, Pace, Target};
 use trigger::{Gate, Wait, is_open};
 
@@ -65,7 +65,11 @@ enum Current {
     /// Nothing before this tick. True: to be reported as settled.
     Wait(u64, bool),
     /// This tick brings a new word.
-    Edge { tick: u64, mask: u32, value: u32 },
+    Edge {
+        tick: u64,
+        mask: u32,
+        value: u32,
+    },
     /// The move ends at this tick.
     Reach(u64),
     Trigger(Wait),
@@ -218,7 +222,11 @@ impl Player {
             Current::Edge { tick, .. } => Next::Word(*tick),
             Current::Reach(tick) => Next::After(*tick),
             Current::Begin(_) | Current::End | Current::Fail(_) => Next::Still,
-            Current::Home(search) if search.decides() && search.due() > known.saturating_add(self.latency) => Next::Input,
+            Current::Home(search)
+                if search.decides() && search.due() > known.saturating_add(self.latency) =>
+            {
+                Next::Input
+            }
             Current::Home(search) => Next::Act(search.due()),
             Current::Trigger(wait) => match (wait.fired, wait.deadline) {
                 (Some(tick), _) => Next::Act(tick.saturating_add(u64::from(wait.delay))),
@@ -233,12 +241,19 @@ impl Player {
     /// Words of a move that would come less than the smallest step before a word of the program are
     /// put into that word; those that would come less than it after one, or after each other, come as soon
     /// as they can. So the program's words are exact, and a step is late by at most 6 ticks.
-    pub(crate) fn play(&mut self, until: u64, known: u64, mut source: Source<'_>, stage: &mut Stage<'_>) -> Progress {
+    pub(crate) fn play(
+        &mut self,
+        until: u64,
+        known: u64,
+        mut source: Source<'_>,
+        stage: &mut Stage<'_>,
+    ) -> Progress {
         self.look(known, stage.out);
         loop {
             let step = self.step_due(stage.out);
             // How far the program may be read: to within the smallest step after a step.
-            let horizon = step.filter(|t| *t <= until).map_or(until, |t| until.max(t.saturating_add(STEP - 1)));
+            let horizon =
+                step.filter(|t| *t <= until).map_or(until, |t| until.max(t.saturating_add(STEP - 1)));
             let wanted = self.wanted(known);
             let before = |tick: u64| step.filter(|t| t.saturating_add(STEP) <= tick);
             let (tick, is_step) = match wanted {
@@ -260,11 +275,8 @@ impl Player {
             if tick > limit || (matches!(wanted, Next::Input) && !is_step) {
                 return Progress::Waiting;
             }
-            let done = if is_step {
-                self.step(tick, stage)
-            } else {
-                self.act(tick, known, &mut source, stage)
-            };
+            let done =
+                if is_step { self.step(tick, stage) } else { self.act(tick, known, &mut source, stage) };
             match done {
                 Some(Progress::Waiting) => {}
                 Some(other) => return other,
@@ -398,13 +410,11 @@ impl Player {
                 self.finish(tick);
             }
             Current::Trigger(wait) => return self.triggered(tick, wait, stage),
-            Current::Home(mut search) => {
-                match search.advance(tick, stage.out, stage.sink)? {
-                    Found::Searching => self.current = Current::Home(search),
-                    Found::Home(tick) => self.finish(tick),
-                    Found::Failed(cause) => return Some(Progress::Failed(cause, tick)),
-                }
-            }
+            Current::Home(mut search) => match search.advance(tick, stage.out, stage.sink)? {
+                Found::Searching => self.current = Current::Home(search),
+                Found::Home(tick) => self.finish(tick),
+                Found::Failed(cause) => return Some(Progress::Failed(cause, tick)),
+            },
             Current::Begin(instruction) => {
                 self.motion = None;
                 self.current = Current::None;
@@ -468,7 +478,13 @@ impl Player {
         Some(Progress::Waiting)
     }
 
-    fn begin(&mut self, tick: u64, instruction: Instruction, known: u64, stage: &mut Stage<'_>) -> Option<()> {
+    fn begin(
+        &mut self,
+        tick: u64,
+        instruction: Instruction,
+        known: u64,
+        stage: &mut Stage<'_>,
+    ) -> Option<()> {
         match instruction {
             Instruction::Edge { mask, value, after } => {
                 self.current = Current::Edge { tick: tick.checked_add(u64::from(after))?, mask, value };
@@ -510,8 +526,7 @@ impl Player {
                 return self.begin(tick, wait, known, stage);
             }
             Instruction::Wait { input, condition, skip, delay, timeout, on_timeout } => {
-                let deadline =
-                    if timeout > 0 { Some(tick.checked_add(u64::from(timeout))?) } else { None };
+                let deadline = if timeout > 0 { Some(tick.checked_add(u64::from(timeout))?) } else { None };
                 let mut wait =
                     Wait { input, condition, skip, delay, since: tick, deadline, on_timeout, fired: None };
                 if known >= tick {
@@ -591,12 +606,7 @@ impl Player {
 pub(crate) fn capture_edges(instruction: &Instruction) -> Option<[Instruction; 4]> {
     let Instruction::Capture { cameras, leds, lead, pulse, hold, .. } = *instruction else { return None };
     let edge = |mask: u32, value: u32, after: u32| Instruction::Edge { mask, value, after };
-    Some([
-        edge(cameras, cameras, 0),
-        edge(leds, leds, lead),
-        edge(leds, 0, pulse),
-        edge(cameras, 0, hold),
-    ])
+    Some([edge(cameras, cameras, 0), edge(leds, leds, lead), edge(leds, 0, pulse), edge(cameras, 0, hold)])
 }
 
 /// Trigger inputs that a change of the input word touches, and whether they rise.

@@ -56,8 +56,7 @@ impl Motion {
         let mut axes = heapless::Vec::new();
         for &(axis, target) in targets {
             let from = out.axis(axis);
-            let moving =
-                Axis { axis, positive: target > from, steps: from.abs_diff(target), due: 0 };
+            let moving = Axis { axis, positive: target > from, steps: from.abs_diff(target), due: 0 };
             axes.push(moving).ok()?;
         }
         let most = axes.iter().map(|a| a.steps).max().unwrap_or(0);

@@ -92,7 +92,11 @@ impl Debt {
             gain: clamp(self.gain.saturating_mul(i64::from(again).saturating_add(1))),
             floor: add(self.floor, times(again)),
             peak_gain: add(self.peak_gain, times(again)),
-            peak_floor: if again == 0 { self.peak_floor } else { self.peak_floor.max(add(last, self.peak_gain)) },
+            peak_floor: if again == 0 {
+                self.peak_floor
+            } else {
+                self.peak_floor.max(add(last, self.peak_gain))
+            },
         }
     }
 }

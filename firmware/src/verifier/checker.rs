@@ -26,8 +26,7 @@ pub(super) fn wait_span(instruction: &Instruction, board: &Board) -> Option<Span
         _ => return None,
     };
     let low = if goes_on && timeout > 0 { delay.min(timeout) } else { delay };
-    let high =
-        if timeout == 0 { FOREVER } else { u64::from(timeout).saturating_add(u64::from(delay)) };
+    let high = if timeout == 0 { FOREVER } else { u64::from(timeout).saturating_add(u64::from(delay)) };
     Some((u64::from(low), high))
 }
 
@@ -135,7 +134,12 @@ impl Checker {
     }
 
     /// The next instruction; loops are for the caller.
-    pub(crate) fn take(&mut self, index: u16, instruction: &Instruction, board: &Board) -> Result<(), Violation> {
+    pub(crate) fn take(
+        &mut self,
+        index: u16,
+        instruction: &Instruction,
+        board: &Board,
+    ) -> Result<(), Violation> {
         rules::check(index, instruction, board)?;
         let err = |rule, value, limit| Err(violation(index, rule, value, limit));
         let moves = rules::pace_of(instruction);

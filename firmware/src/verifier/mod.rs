@@ -105,8 +105,7 @@ fn led_limits(program: &[u8], board: &Board) -> (Limits, bool) {
     let mut lowest = [None::<u16>; LEDS];
     for (_, instruction) in decode(program) {
         if let Ok(Instruction::Level { led, level }) = instruction
-            && let (Some(h), Some(l)) =
-                (highest.get_mut(usize::from(led)), lowest.get_mut(usize::from(led)))
+            && let (Some(h), Some(l)) = (highest.get_mut(usize::from(led)), lowest.get_mut(usize::from(led)))
         {
             *h = (*h).max(level);
             *l = Some(l.map_or(level, |l| l.min(level)));
@@ -232,7 +231,9 @@ impl<'a> Verifier<'a> {
             }
             Instruction::Join { axis, target } => {
                 let full = self.joined.len().saturating_add(1) >= AXES;
-                if full || self.joined.iter().any(|(a, _)| *a == axis) || self.joined.push((axis, target)).is_err()
+                if full
+                    || self.joined.iter().any(|(a, _)| *a == axis)
+                    || self.joined.push((axis, target)).is_err()
                 {
                     return err(Rule::BadJoin, i64::from(axis), 0);
                 }

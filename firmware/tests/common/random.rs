@@ -41,7 +41,9 @@ fn leaf(moves: bool) -> impl Strategy<Value = Vec<Instruction>> {
             Instruction::Edge { mask, value: 0, after: length },
         ]
     });
-    let pace = || (1000u32..=250_000, 1_000_000u32..=1_000_000_000, prop_oneof![Just(0u32), 1_000_000_000..=u32::MAX]);
+    let pace = || {
+        (1000u32..=250_000, 1_000_000u32..=1_000_000_000, prop_oneof![Just(0u32), 1_000_000_000..=u32::MAX])
+    };
     let join = || prop_oneof![3 => Just(None), 1 => (-40i32..=40).prop_map(Some)];
     let go = (0u8..2, -40i32..=40, pace(), join()).prop_map(|(axis, target, pace, join)| {
         let (max_rate, acceleration, jerk) = pace;
