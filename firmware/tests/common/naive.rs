@@ -266,7 +266,15 @@ impl Player<'_> {
                 | Instruction::Gate { .. }
                 | Instruction::NoGate
                 | Instruction::Policy(_) => unreachable!("tested elsewhere"),
-                Instruction::Stop => self.stopped = true,
+                Instruction::Stop => {
+                    if !self.joined.is_empty() {
+                        self.broke(Rule::BadJoin);
+                    }
+                    if self.going.is_some() {
+                        self.broke(Rule::MoveNotEnded);
+                    }
+                    self.stopped = true;
+                }
             }
             i += 1;
         }
