@@ -200,7 +200,7 @@ impl Controller {
         if changed & EXPOSURE_MASK != 0 && self.board.capabilities & Capabilities::EXPOSURE_ACTIVE != 0 {
             self.out.exposures(tick, changed);
         }
-        if let Some((player, _)) = &mut self.player {
+        if let Some((player, true)) = &mut self.player {
             for (input, rising) in trigger_edges(before, word) {
                 if !player.trigger(tick, input, rising, &self.out) && rising {
                     self.out.inputs.miss(input);
