@@ -99,7 +99,7 @@ enum Next {
 }
 
 /// Where a program has got to.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct Player {
     /// End of the last instruction.
     now: u64,
