@@ -90,8 +90,6 @@ enum Next {
     Word(u64),
     /// Something else at this tick.
     Act(u64),
-    /// Something that comes after all words of a move up to this tick.
-    After(u64),
     /// Something that comes when all words of the move are out.
     Still,
     /// Nothing until an input changes.
@@ -194,7 +192,7 @@ impl Player {
     pub(crate) fn due(&self, out: &Outputs, host: u64) -> Option<u64> {
         let step = self.step_due(out);
         let program = match self.wanted(u64::MAX) {
-            Next::Word(t) | Next::Act(t) | Next::After(t) => Some(t),
+            Next::Word(t) | Next::Act(t) => Some(t),
             Next::Still => step.or(Some(self.now)),
             Next::Input => None,
         };
@@ -218,9 +216,9 @@ impl Player {
     fn wanted(&self, known: u64) -> Next {
         match &self.current {
             Current::None => Next::Act(self.now),
-            Current::Wait(tick, _) | Current::Ending(tick) => Next::Act(*tick),
+            // The last word of a move may have to make way for one that the program puts out at once.
+            Current::Wait(tick, _) | Current::Ending(tick) | Current::Reach(tick) => Next::Act(*tick),
             Current::Edge { tick, .. } => Next::Word(*tick),
-            Current::Reach(tick) => Next::After(*tick),
             Current::Begin(_) | Current::End | Current::Fail(_) => Next::Still,
             Current::Home(search)
                 if search.decides() && search.due() > known.saturating_add(self.latency) =>
@@ -258,7 +256,6 @@ impl Player {
             let before = |tick: u64| step.filter(|t| t.saturating_add(STEP) <= tick);
             let (tick, is_step) = match wanted {
                 Next::Word(tick) | Next::Act(tick) => before(tick).map_or((tick, false), |t| (t, true)),
-                Next::After(tick) => step.filter(|t| *t <= tick).map_or((tick, false), |t| (t, true)),
                 Next::Still => step.map_or((self.now, false), |t| (t, true)),
                 Next::Input => match step {
                     Some(t) => (t, true),
