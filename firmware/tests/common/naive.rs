@@ -71,12 +71,16 @@ pub fn s_curve_ticks(n: u128, v: u128, a: u128, j: u128) -> (Vec<u64>, u64) {
         return (Vec::new(), 0);
     }
     let (q, p, m, s) = slices(n, v, a, j);
+    // Value i of the convolution with a box is the sum of the box's length of values up to i.
     let convolve = |x: &[u128], len: u128| {
-        let mut out = vec![0; x.len() + len as usize - 1];
-        for (i, x) in x.iter().enumerate() {
-            for o in &mut out[i..i + len as usize] {
-                *o += x;
+        let mut sum = 0;
+        let mut out = Vec::new();
+        for i in 0..x.len() + len as usize - 1 {
+            sum += x.get(i).copied().unwrap_or(0);
+            if let Some(left) = i.checked_sub(len as usize) {
+                sum -= x.get(left).copied().unwrap_or(0);
             }
+            out.push(sum);
         }
         out
     };
