@@ -71,6 +71,28 @@ fn a_word_right_after_a_move_beside_it() {
     }
 }
 
+/// Played from one thing due to the next: each look makes progress, also where a step waits for a word.
+#[test]
+fn what_is_due_is_done() {
+    let aside = Instruction::Go { axis: 0, target: 3, max_rate: 50_000, acceleration: 1_000_000, jerk: 0 };
+    // The first step of this move is planned 4 + 625 ticks and 176 776 after its begin.
+    for shift in 0..8 {
+        let at = 4 + 625 + 176_776 - 4 + shift;
+        let program = [aside, edge(0x100, 0x100, at), edge(0x100, 0, 9), Instruction::Reach];
+        let mut rig = Rig::new(small_board());
+        let expected = compare(&mut rig, &program, None);
+        let mut rig = Rig::new(small_board());
+        rig.start(&program);
+        let mut looks = 0;
+        while let Some(due) = rig.controller.next_due() {
+            rig.play_to(due);
+            looks += 1;
+            assert!(looks < 1000, "{shift}: stuck at {due}");
+        }
+        assert_eq!(rig.out.words, expected.words);
+    }
+}
+
 #[test]
 fn the_first_tick_is_the_lead_after_start() {
     let mut rig = Rig::new(small_board());

@@ -191,10 +191,12 @@ impl Player {
     /// Tick of the next thing to be done; `None` while only an input can bring one.
     pub(crate) fn due(&self, out: &Outputs, host: u64) -> Option<u64> {
         let step = self.step_due(out);
-        let program = match self.wanted(u64::MAX) {
-            Next::Word(t) | Next::Act(t) => Some(t),
-            Next::Still => step.or(Some(self.now)),
-            Next::Input => None,
+        let (step, program) = match self.wanted(u64::MAX) {
+            // A step too close before a word comes with it.
+            Next::Word(t) => (step.filter(|s| s.saturating_add(STEP) <= t), Some(t)),
+            Next::Act(t) => (step, Some(t)),
+            Next::Still => (step, step.or(Some(self.now))),
+            Next::Input => (step, None),
         };
         let light = out.light_deadline().map(|(t, _)| t);
         let host = self.host_deadline(host);
