@@ -4,6 +4,7 @@
 //! and what could not be run on this machine, with the reason.
 
 mod bench;
+mod campaign;
 mod steps;
 
 use std::process::ExitCode;
@@ -19,6 +20,8 @@ cargo xtask COMMAND
   coverage   2 000 simulated calibrations: what the stated uncertainties cover (minutes)
   reproduce  macro: chapter 2 of the thesis, micro: chapter 3, simulated and measured, into
              docs/reproduction.md
+  hil        --faults N: N more runs of the fault campaign; totals in docs/campaigns/faults.json
+             --verifier [--long]: 10 000 (1 000 000) random programs through the verifier
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders
              guard [--update]: instruction counts against the baseline (or: makes a new one)
@@ -38,6 +41,11 @@ fn main() -> ExitCode {
         ["figures"] => steps::figures(),
         ["coverage"] => steps::coverage(),
         ["reproduce", chapter @ ("macro" | "micro")] => steps::reproduce(chapter),
+        ["hil", "--faults", count] if count.parse::<u64>().is_ok() => {
+            campaign::faults(count.parse().unwrap_or(0))
+        }
+        ["hil", "--verifier"] => campaign::verifier(10_000),
+        ["hil", "--verifier", "--long"] => campaign::verifier(1_000_000),
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),
         ["bench", "optics"] => steps::bench_optics(),
