@@ -26,6 +26,9 @@ pub fn line_name(bit: u8) -> String {
     }
 }
 
+/// A change of the lines: tick from the begin of the run, and the lines' word from then on.
+pub type Change = (u64, u32);
+
 /// Where planned and played differ.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
 pub struct Difference {
@@ -36,7 +39,7 @@ pub struct Difference {
     /// Largest shift of a change, in ticks, over those that both have in the same order.
     pub largest_shift_ticks: u64,
     /// The first change that only one of them has, or that differs: its number, planned, played.
-    pub first: Option<(usize, Option<(u64, u32)>, Option<(u64, u32)>)>,
+    pub first: Option<(usize, Option<Change>, Option<Change>)>,
     /// Parts of the time (begin and end, in ticks) in which some line differs.
     pub spans: Vec<(u64, u64)>,
 }
