@@ -14,8 +14,8 @@ use daic_protocol::program::ProgramBytes;
 use crate::config::{BoardConfig, ClockMode, FaultsConfig, HomeConfig, OverdriveConfig, SimConfig};
 use crate::hash::mix;
 use crate::record::Record;
-use crate::transport::Link;
 use crate::slots::Slots;
+use crate::transport::Link;
 use crate::world::{ExposureRecord, Wiring, World};
 
 /// In stepped mode a program is played for so many virtual seconds before the link is polled in between.

@@ -83,13 +83,7 @@ pub fn difference(planned: &Words, played: &Words) -> Difference {
     if let Some(begin) = open {
         spans.push((begin, u64::MAX));
     }
-    Difference {
-        planned: planned.len(),
-        played: played.len(),
-        largest_shift_ticks: shift,
-        first,
-        spans,
-    }
+    Difference { planned: planned.len(), played: played.len(), largest_shift_ticks: shift, first, spans }
 }
 
 /// A value change dump with one wire per line that ever changes; `scopes` are drawn one under another.
@@ -194,7 +188,8 @@ pub fn svg(traces: &[(&str, &str, &Words)], spans: &[(u64, u64)]) -> String {
     for tenth in 0..=10u64 {
         let tick = (u128::from(end) * u128::from(tenth) / 10) as u64;
         let ms = tick as f64 * 1e3 / f64::from(TICK_HZ);
-        writeln!(out, "<text x=\"{:.1}\" y=\"{foot}\" text-anchor=\"middle\">{ms:.3} ms</text>", x(tick)).ok();
+        writeln!(out, "<text x=\"{:.1}\" y=\"{foot}\" text-anchor=\"middle\">{ms:.3} ms</text>", x(tick))
+            .ok();
     }
     out.push_str("</svg>\n");
     out
@@ -209,7 +204,8 @@ pub fn html(title: &str, traces: &[(&str, &str, &Words)], found: Option<&Differe
         escape(title)
     );
     for (name, colour, words) in traces {
-        write!(page, "<span style=\"color:{colour}\">▬ {} ({} changes)</span> ", escape(name), words.len()).ok();
+        write!(page, "<span style=\"color:{colour}\">▬ {} ({} changes)</span> ", escape(name), words.len())
+            .ok();
     }
     page.push_str("</p>\n");
     if let Some(d) = found {
@@ -236,9 +232,7 @@ pub fn html(title: &str, traces: &[(&str, &str, &Words)], found: Option<&Differe
 pub fn played(events: &[daic_protocol::message::Event], begin: u64) -> Vec<(u64, u32)> {
     use daic_protocol::message::EventKind;
     let words = events.iter().filter_map(|event| match event.kind {
-        EventKind::Edge { word, .. } => {
-            Some((event.tick.saturating_sub(begin), word & !channels::AXIS_MASK))
-        }
+        EventKind::Edge { word, .. } => Some((event.tick.saturating_sub(begin), word & !channels::AXIS_MASK)),
         _ => None,
     });
     crate::expand::changes(&words.collect::<Vec<_>>())

@@ -54,12 +54,23 @@ fn run_faults(count: u64) -> Result<(), String> {
     while left > 0 {
         let first = state["next_seed"].as_u64().ok_or("docs/campaigns/faults.json: no next_seed")?;
         let runs = left.min(BLOCK);
-        let status = cargo(&["test", "--release", "--locked", "-p", "daic-rig", "--test", "faults", "--", "whatever", "--nocapture"])
-            .env("DAIC_FAULTS", runs.to_string())
-            .env("DAIC_FAULTS_FIRST", first.to_string())
-            .env("DAIC_FAULTS_TOTALS", &block_file)
-            .status()
-            .map_err(|e| fail("cargo did not start", &e))?;
+        let status = cargo(&[
+            "test",
+            "--release",
+            "--locked",
+            "-p",
+            "daic-rig",
+            "--test",
+            "faults",
+            "--",
+            "whatever",
+            "--nocapture",
+        ])
+        .env("DAIC_FAULTS", runs.to_string())
+        .env("DAIC_FAULTS_FIRST", first.to_string())
+        .env("DAIC_FAULTS_TOTALS", &block_file)
+        .status()
+        .map_err(|e| fail("cargo did not start", &e))?;
         if !status.success() {
             return Err(format!("seeds {first} … {}: {status}", first + runs - 1));
         }
@@ -80,7 +91,9 @@ fn run_faults(count: u64) -> Result<(), String> {
         std::fs::create_dir_all(folder).map_err(|e| fail("docs/campaigns", &e))?;
         let whole = format!("{state:#}\n");
         let part = file.with_extension("part");
-        std::fs::write(&part, whole).and_then(|()| std::fs::rename(&part, &file)).map_err(|e| fail("docs/campaigns", &e))?;
+        std::fs::write(&part, whole)
+            .and_then(|()| std::fs::rename(&part, &file))
+            .map_err(|e| fail("docs/campaigns", &e))?;
         left -= runs;
     }
     Ok(())
@@ -90,9 +103,19 @@ fn run_faults(count: u64) -> Result<(), String> {
 pub fn verifier(cases: u64) -> Report {
     let mut report = Report::default();
     report.step(&format!("verifier against a player that unrolls everything, {cases} programs"), || {
-        let status = cargo(&["test", "--release", "--locked", "-p", "daic-firmware", "--test", "verifier", "--", "--nocapture"])
-            .env("DAIC_CASES", cases.to_string())
-            .status();
+        let status = cargo(&[
+            "test",
+            "--release",
+            "--locked",
+            "-p",
+            "daic-firmware",
+            "--test",
+            "verifier",
+            "--",
+            "--nocapture",
+        ])
+        .env("DAIC_CASES", cases.to_string())
+        .status();
         match status {
             Ok(status) if status.success() => Outcome::Passed,
             Ok(status) => Outcome::Failed(status.to_string()),

@@ -121,16 +121,13 @@ pub fn program(data: &[u8]) {
     }
     let mut controller = Controller::new(board, 7);
     let mut out = Checked::default();
-    let mut ask = |controller: &mut Controller, out: &mut Checked, now: u64, id: u32, request: &Request| {
+    let ask = |controller: &mut Controller, out: &mut Checked, now: u64, id: u32, request: &Request| {
         let frame = encode_request(id, request).expect("fits");
         let mut done = false;
         let mut decoder = Decoder::new();
         controller.receive(now, &frame, out, &mut |bytes| {
             for &byte in bytes {
-                done |= matches!(
-                    decoder.feed_reply(byte),
-                    Fed::Message { message: Reply::Done { .. }, .. }
-                );
+                done |= matches!(decoder.feed_reply(byte), Fed::Message { message: Reply::Done { .. }, .. });
             }
         });
         done

@@ -110,12 +110,7 @@ impl SimConfig {
             0.0,
             f64::from(daic_protocol::channels::INPUTS),
         )?;
-        within(
-            "board.slots",
-            f64::from(self.board.slots),
-            0.0,
-            daic_protocol::limits::MAX_SLOTS as f64,
-        )?;
+        within("board.slots", f64::from(self.board.slots), 0.0, daic_protocol::limits::MAX_SLOTS as f64)?;
         if let Some(pair) = self.board.stimulus.windows(2).find(|p| p[1].tick < p[0].tick) {
             let (value, min) = (pair[1].tick as f64, pair[0].tick as f64);
             return Err(ConfigError::OutOfRange { key: "board.stimulus (tick)", value, min, max: f64::MAX });

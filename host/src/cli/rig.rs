@@ -140,13 +140,17 @@ pub fn run(arguments: &RigArgs, output: &Output) -> Result<Answer, Error> {
         }
         RigCommand::Move { axis, target, rate, acceleration, jerk } => {
             let (axis, target) = (*axis, *target);
-            let go = Instruction::Move { axis, target, max_rate: *rate, acceleration: *acceleration, jerk: *jerk };
+            let go =
+                Instruction::Move { axis, target, max_rate: *rate, acceleration: *acceleration, jerk: *jerk };
             play(&mut link, &[go], output)
         }
         RigCommand::Store { slot, program, on_power_up, on_input, erase } => {
             if *erase {
                 rig(link.erase(*slot))?;
-                return Ok(Answer::new(json!({ "slot": slot, "erased": true }), format!("slot {slot} is empty")));
+                return Ok(Answer::new(
+                    json!({ "slot": slot, "erased": true }),
+                    format!("slot {slot} is empty"),
+                ));
             }
             if let Some(program) = program {
                 load(&mut link, program)?;
@@ -170,7 +174,8 @@ pub fn run(arguments: &RigArgs, output: &Output) -> Result<Answer, Error> {
             }
             rig(link.load(&encode(&instructions)?))?;
             let events = play_loaded(&mut link, output)?;
-            let begin = events.iter().find(|e| matches!(e.kind, EventKind::RunStarted { .. })).map_or(0, |e| e.tick);
+            let begin =
+                events.iter().find(|e| matches!(e.kind, EventKind::RunStarted { .. })).map_or(0, |e| e.tick);
             let played = timeline::played(&events, begin);
             draw(out, &timeline::without_axes(&planned), Some(&played))
         }
@@ -204,7 +209,8 @@ fn info(link: &mut Link) -> Result<Answer, Error> {
         status.run
     );
     if let Some(fault) = status.fault {
-        writeln!(text, "fault: {:?} at tick {}, instruction {}", fault.cause, fault.tick, fault.instruction).ok();
+        writeln!(text, "fault: {:?} at tick {}, instruction {}", fault.cause, fault.tick, fault.instruction)
+            .ok();
     }
     for (axis, position) in status.position.iter().enumerate().take(usize::from(hello.axes)) {
         let homed = if inputs.homed >> axis & 1 == 1 { "" } else { " (not homed)" };
@@ -220,7 +226,12 @@ fn info(link: &mut Link) -> Result<Answer, Error> {
         .ok();
     }
     for slot in &slots {
-        writeln!(text, "slot {}: {} bytes, hash {:#010x}, {:?}", slot.slot, slot.length, slot.hash, slot.autostart).ok();
+        writeln!(
+            text,
+            "slot {}: {} bytes, hash {:#010x}, {:?}",
+            slot.slot, slot.length, slot.hash, slot.autostart
+        )
+        .ok();
     }
     let json = json!({
         "hello": as_json(&hello)?,
@@ -300,7 +311,8 @@ fn stream(link: &mut Link, path: &std::path::Path, output: &Output) -> Result<An
         EventKind::StreamLead { ticks } if ticks != u64::MAX => Some(ticks as f64 * 1e3 / f64::from(TICK_HZ)),
         _ => None,
     });
-    let text = lead.map_or("played; it fitted the memory".to_owned(), |ms| format!("played; smallest lead {ms:.3} ms"));
+    let text = lead
+        .map_or("played; it fitted the memory".to_owned(), |ms| format!("played; smallest lead {ms:.3} ms"));
     Ok(Answer::new(json!({ "instructions": count, "min_lead_ms": lead, "events": events.len() }), text))
 }
 
@@ -320,7 +332,10 @@ fn watch(link: &mut Link, output: &Output) -> Result<Answer, Error> {
         std::thread::sleep(POLL);
     }
     let seconds = begin.elapsed().as_secs_f64();
-    Ok(Answer::new(json!({ "events": count, "seconds": seconds }), format!("{count} events in {seconds:.1} s")))
+    Ok(Answer::new(
+        json!({ "events": count, "seconds": seconds }),
+        format!("{count} events in {seconds:.1} s"),
+    ))
 }
 
 fn self_test(link: &mut Link) -> Result<Answer, Error> {
@@ -345,7 +360,11 @@ fn self_test(link: &mut Link) -> Result<Answer, Error> {
     Ok(Answer::new(as_json(&found)?, text).checked(found.failed == 0))
 }
 
-fn draw(out: &std::path::Path, planned: &timeline::Words, played: Option<&timeline::Words>) -> Result<Answer, Error> {
+fn draw(
+    out: &std::path::Path,
+    planned: &timeline::Words,
+    played: Option<&timeline::Words>,
+) -> Result<Answer, Error> {
     let found = played.map(|played| timeline::difference(planned, played));
     let mut traces = vec![("planned", "#06c", planned)];
     let mut scopes = vec![("planned", planned)];

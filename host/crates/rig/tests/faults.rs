@@ -97,7 +97,8 @@ impl World {
             self.pass(BYTE);
             let now = self.now;
             let run = self.controller.run();
-            self.controller.receive(now, &[byte], &mut self.wires, &mut |frame| back.extend_from_slice(frame));
+            self.controller
+                .receive(now, &[byte], &mut self.wires, &mut |frame| back.extend_from_slice(frame));
             if self.controller.run() != run
                 && let Some(due) = self.controller.next_due()
             {
@@ -314,15 +315,21 @@ fn campaign_run(seed: u64, totals: &mut Totals) {
                     totals.count(link.abort())?;
                     assert_eq!(lock(&world).controller.word(), 0, "seed {seed}: abort is safe at once");
                 }
-                let end = events.iter().rev().find(|e| {
-                    matches!(e.kind, EventKind::RunDone { .. } | EventKind::Faulted { .. })
-                });
+                let end = events
+                    .iter()
+                    .rev()
+                    .find(|e| matches!(e.kind, EventKind::RunDone { .. } | EventKind::Faulted { .. }));
                 if let Some(end) = end {
                     if let EventKind::RunDone { events: announced, run, .. } = end.kind {
-                        let begin = events.iter().position(|e| matches!(e.kind, EventKind::RunStarted { run: r, .. } if r == run));
+                        let begin = events
+                            .iter()
+                            .position(|e| matches!(e.kind, EventKind::RunStarted { run: r, .. } if r == run));
                         let seen = begin.map(|b| events.len() - b);
                         // What was lost is known to be lost.
-                        assert!(gap || seen == Some(announced as usize), "seed {seed}: {seen:?} of {announced}");
+                        assert!(
+                            gap || seen == Some(announced as usize),
+                            "seed {seed}: {seen:?} of {announced}"
+                        );
                     }
                     break;
                 }

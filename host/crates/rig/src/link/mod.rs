@@ -20,8 +20,8 @@ use crate::clock::ClockSample;
 use daic_protocol::frame::{self, Decoder, Fed};
 use daic_protocol::limits::{CHUNK_LEN, PROTOCOL_VERSION};
 use daic_protocol::message::{
-    Autostart, Events, Hello, Inputs, Rejected, Reply, Request, SCHEMA_HASH, SelfTest, SlotInfo, State, Status,
-    StreamState,
+    Autostart, Events, Hello, Inputs, Rejected, Reply, Request, SCHEMA_HASH, SelfTest, SlotInfo, State,
+    Status, StreamState,
 };
 use std::io;
 use std::time::{Duration, Instant};
