@@ -173,9 +173,9 @@ fn check(scene: &Scene, cross: bool, one_pose: bool, limit: f64) -> Outcome {
     println!("  brown {:?} ± {:?}", found.brown.brown, found.brown.sigma);
     assert!(inside.len() > scene.size[0] * scene.size[1] / 49 / 2, "{}", inside.len());
     assert!(rms(&x) < limit && rms(&y) < limit, "{} {}", rms(&x), rms(&y));
-    // What is left is stated, neither too small nor much too large.
+    // What is left is stated, neither too small nor too large: 0.95 to 1.01 of it measured.
     for (stated, is) in [(tx, rms(&x)), (ty, rms(&y))] {
-        assert!(stated > 0.9 * is && stated < 3.0 * is, "stated {stated}, is {is}");
+        assert!(stated > 0.9 * is && stated < 1.2 * is, "stated {stated}, is {is}");
     }
     // Where the window leaves the image Brown's terms and smoothness carry the map on.
     assert!(rms(&bx) < 0.02 && rms(&by) < 0.02);
