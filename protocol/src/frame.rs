@@ -27,7 +27,7 @@ pub const MAX_FRAME: usize = MAX_PAYLOAD + MAX_PAYLOAD / 254 + 2;
 pub const VERSION: u8 = PROTOCOL_VERSION as u8;
 const _: () = assert!(PROTOCOL_VERSION < 256, "the header has one byte for the version");
 
-const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
+pub(crate) static CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
 
 /// CRC-32/ISO-HDLC (polynomial 0x04c11db7 reflected, initial value and final xor 0xffffffff).
 ///

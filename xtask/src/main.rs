@@ -1,9 +1,10 @@
-//! The one entry for people and CI: `cargo xtask test | lint | figures | bench`.
+//! The one entry for people and CI: `cargo xtask test | lint | figures | reproduce | bench`.
 //!
 //! Every step runs even when an earlier one failed, and the end names what passed, what failed
 //! and what could not be run on this machine, with the reason.
 
 mod bench;
+mod campaign;
 mod steps;
 
 use std::process::ExitCode;
@@ -16,6 +17,11 @@ cargo xtask COMMAND
   lint       formatting, clippy, documentation without warnings, cargo-deny where installed
   ci         test, then lint
   figures    draws the pictures of README and docs anew with the program itself
+  coverage   2 000 simulated calibrations: what the stated uncertainties cover (minutes)
+  reproduce  macro: chapter 2 of the thesis, micro: chapter 3, simulated and measured, into
+             docs/reproduction.md
+  hil        --faults N: N more runs of the fault campaign; totals in docs/campaigns/faults.json
+             --verifier [--long]: 10 000 (1 000 000) random programs through the verifier
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders
              lightfield: speed and memory beside pyolaf, into docs/performance.md
@@ -35,6 +41,13 @@ fn main() -> ExitCode {
             report
         }
         ["figures"] => steps::figures(),
+        ["coverage"] => steps::coverage(),
+        ["reproduce", chapter @ ("macro" | "micro")] => steps::reproduce(chapter),
+        ["hil", "--faults", count] if count.parse::<u64>().is_ok() => {
+            campaign::faults(count.parse().unwrap_or(0))
+        }
+        ["hil", "--verifier"] => campaign::verifier(10_000),
+        ["hil", "--verifier", "--long"] => campaign::verifier(1_000_000),
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),
         ["bench", "lightfield"] => bench::lightfield::lightfield(),

@@ -52,6 +52,10 @@ impl Output {
         Self { json, bar, stage: Mutex::default(), stop: Arc::default(), lines: !quiet && !terminal }
     }
 
+    pub fn is_json(&self) -> bool {
+        self.json
+    }
+
     /// Errors are drawn with the source line underlined, without colour where nobody can see it.
     pub fn install_error_style(&self) {
         // a second installation in one process is refused and harmless
@@ -69,6 +73,13 @@ impl Output {
             let armed = Arc::clone(&self.stop);
             signal_hook::flag::register_conditional_shutdown(signal, 130, armed).ok();
             signal_hook::flag::register(signal, Arc::clone(&self.stop)).ok();
+        }
+    }
+
+    /// A line on stderr, for what cannot wait for the answer.
+    pub fn note(&self, line: &str) {
+        if !self.bar.is_hidden() || self.lines {
+            self.bar.suspend(|| eprintln!("{line}"));
         }
     }
 
