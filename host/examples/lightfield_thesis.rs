@@ -4,8 +4,8 @@
 //! reconstructed with three, 2.5 µm and five: no inverse crime. Argument: the docs folder.
 
 use daic_lightfield::{
-    DiffractionModel, Frame, Grating, Lenslets, Method, Model, Operator, OperatorSettings, Order, Oversampling, Psf,
-    PsfParameters, Radius, Settings, native_widths, reconstruct,
+    DiffractionModel, Frame, Grating, Lenslets, Method, Model, Operator, OperatorSettings, Order,
+    Oversampling, Psf, PsfParameters, Radius, Settings, native_widths, reconstruct,
 };
 use daic_report::{Chart, ColourScale, GridAxes, Heatmap, Series, SeriesStyle};
 use std::error::Error;
@@ -68,7 +68,11 @@ impl View {
     fn new(optics: &Optics, fine: bool) -> Result<Self> {
         let parameters = optics.parameters(fine);
         let psf = Psf::compute(&parameters)?;
-        println!("{optics:?} fine {fine}: energy {:.3}, sampling error {:.1e}", psf.report.energy.iter().copied().fold(1.0, f64::min), psf.report.sampling_error);
+        println!(
+            "{optics:?} fine {fine}: energy {:.3}, sampling error {:.1e}",
+            psf.report.energy.iter().copied().fold(1.0, f64::min),
+            psf.report.sampling_error
+        );
         let voxel_um = parameters.voxel_um()[0];
         let model = Model {
             operator: Operator::new(&psf, &OperatorSettings::new([CELLS; 2]))?,
@@ -100,7 +104,8 @@ impl View {
                                 p[1] + part(s / 4 % 4) * self.voxel_um - c[1],
                                 p[2] + part(s / 16) * dz - c[2],
                             ];
-                            inside += usize::from(d.iter().map(|d| d * d).sum::<f64>() <= 0.25 * BEAD_UM * BEAD_UM);
+                            inside +=
+                                usize::from(d.iter().map(|d| d * d).sum::<f64>() <= 0.25 * BEAD_UM * BEAD_UM);
                         }
                     }
                     // light per volume, whatever the voxels' size
@@ -137,7 +142,8 @@ impl View {
     /// Profiles along x, y and z through the voxel nearest to a point, as (position, value).
     fn profiles(&self, volume: &[f32], centre: [f64; 3]) -> [Vec<(f64, f64)>; 3] {
         let [nz, ny, nx] = self.model.operator.volume_shape();
-        let place = |v: f64, n: usize| ((v / self.voxel_um + 0.5 * n as f64 - 0.5).round() as usize).min(n - 1);
+        let place =
+            |v: f64, n: usize| ((v / self.voxel_um + 0.5 * n as f64 - 0.5).round() as usize).min(n - 1);
         let at = |i: usize, n: usize| (i as f64 + 0.5 - 0.5 * n as f64) * self.voxel_um;
         let (x, y) = (place(centre[0], nx), place(centre[1], ny));
         let dz = self.model.voxel_um[0];
@@ -155,10 +161,13 @@ impl View {
 /// Full width at half maximum of a profile's highest peak, linear between samples; NaN where it does not fall
 /// to half on both sides.
 fn fwhm(profile: &[(f64, f64)]) -> f64 {
-    let Some(top) = (0..profile.len()).max_by(|&a, &b| profile[a].1.total_cmp(&profile[b].1)) else { return f64::NAN };
+    let Some(top) = (0..profile.len()).max_by(|&a, &b| profile[a].1.total_cmp(&profile[b].1)) else {
+        return f64::NAN;
+    };
     let half = 0.5 * profile[top].1;
     let cross = |a: (f64, f64), b: (f64, f64)| a.0 + (half - a.1) / (b.1 - a.1) * (b.0 - a.0);
-    let right = (top + 1..profile.len()).find(|&i| profile[i].1 < half).map(|i| cross(profile[i - 1], profile[i]));
+    let right =
+        (top + 1..profile.len()).find(|&i| profile[i].1 < half).map(|i| cross(profile[i - 1], profile[i]));
     let left = (0..top).rev().find(|&i| profile[i].1 < half).map(|i| cross(profile[i + 1], profile[i]));
     match (left, right) {
         (Some(l), Some(r)) => r - l,
@@ -230,7 +239,9 @@ impl Page<'_> {
     /// Maximum along y (x to the right, z down).
     fn mip(&mut self, name: &str, title: &str, view: &View, volume: &[f32]) -> Result<()> {
         let [nz, ny, nx] = view.model.operator.volume_shape();
-        for (suffix, height, dy, y0) in [("xy", ny, view.voxel_um, 0.0), ("xz", nz, view.model.voxel_um[0], view.planes[0])] {
+        for (suffix, height, dy, y0) in
+            [("xy", ny, view.voxel_um, 0.0), ("xz", nz, view.model.voxel_um[0], view.planes[0])]
+        {
             let mut values = vec![0f64; height * nx];
             for (i, v) in volume.iter().enumerate() {
                 let row = if suffix == "xy" { i / nx % ny } else { i / (nx * ny) };
@@ -293,7 +304,10 @@ fn um(v: f64) -> String {
 }
 
 fn angles(page: &mut Page<'_>) -> Result<()> {
-    writeln!(page.text, "## Figures 16 and 17: with and without the grating, and its angle\n\nOne 12 µm bead at z = 20 µm, FWHM in µm (*open*: the profile does not fall to half within the box).\n")?;
+    writeln!(
+        page.text,
+        "## Figures 16 and 17: with and without the grating, and its angle\n\nOne 12 µm bead at z = 20 µm, FWHM in µm (*open*: the profile does not fall to half within the box).\n"
+    )?;
     row(&mut page.text, &["data", "reconstruction", "angle", "x", "y", "z", "peak at z"].map(String::from));
     row(&mut page.text, &["---"; 7].map(String::from));
     let bead = [0.0, 0.0, 20.0];
@@ -309,12 +323,17 @@ fn angles(page: &mut Page<'_>) -> Result<()> {
             let images = fine.images(&fine.spheres(&[bead]))?;
             let found = view.reconstruct(&camera(&images, 16, None, 1), ITERATIONS)?;
             let ([x, y, z], top, profiles) = widths(&view, &found, bead);
-            let name = |m: DiffractionModel| if angle == 0.0 { "none".to_owned() } else { format!("{m:?}").to_lowercase() };
+            let name = |m: DiffractionModel| {
+                if angle == 0.0 { "none".to_owned() } else { format!("{m:?}").to_lowercase() }
+            };
             row(&mut page.text, &[name(data), name(with), format!("{angle}°"), um(x), um(y), um(z), um(top)]);
             if data == with {
                 series.push(normalised(&format!("{angle}° {}", name(data)), &profiles[2]));
             }
-            println!("{angle} {data:?} {with:?}: {x:.2} {y:.2} {z:.2} at {top:.1}, energy {:?}", view.report.energy.last());
+            println!(
+                "{angle} {data:?} {with:?}: {x:.2} {y:.2} {z:.2} at {top:.1}, energy {:?}",
+                view.report.energy.last()
+            );
         }
     }
     writeln!(page.text)?;
@@ -323,9 +342,14 @@ fn angles(page: &mut Page<'_>) -> Result<()> {
 
 fn seven(page: &mut Page<'_>) -> Result<()> {
     writeln!(page.text, "## Figure 16: seven beads in 256 × 256 × 40 µm\n")?;
-    row(&mut page.text, &["reconstruction", "lateral FWHM, mean", "axial FWHM, mean", "axial, open"].map(String::from));
+    row(
+        &mut page.text,
+        &["reconstruction", "lateral FWHM, mean", "axial FWHM, mean", "axial, open"].map(String::from),
+    );
     row(&mut page.text, &["---"; 4].map(String::from));
-    for (name, optics) in [("plain", PLAIN), ("virtual", with_grating(0.9, 8, VIRTUAL)), ("pupil", with_grating(0.9, 8, PUPIL))] {
+    for (name, optics) in
+        [("plain", PLAIN), ("virtual", with_grating(0.9, 8, VIRTUAL)), ("pupil", with_grating(0.9, 8, PUPIL))]
+    {
         let [fine, view] = pair([optics; 2])?;
         let images = fine.images(&fine.spheres(&SEVEN))?;
         let found = view.reconstruct(&camera(&images, 16, None, 2), ITERATIONS)?;
@@ -368,7 +392,9 @@ fn depth_bits_noise(page: &mut Page<'_>) -> Result<()> {
         figures[figure].push(normalised(name, &shifted));
     }
     writeln!(page.text)?;
-    for (name, title, series) in [("fig18", "Depth of the bead", 0), ("fig19", "Bits of the camera", 1), ("fig21", "White noise", 2)] {
+    for (name, title, series) in
+        [("fig18", "Depth of the bead", 0), ("fig19", "Bits of the camera", 1), ("fig21", "White noise", 2)]
+    {
         page.chart(name, title, "z from the bead, µm", "g, relative", std::mem::take(&mut figures[series]))?;
     }
     Ok(())
@@ -392,7 +418,14 @@ fn convergence(page: &mut Page<'_>) -> Result<()> {
         to_last.push((n as f64, distance(&g, &last)));
     }
     let at = |list: &[(f64, f64)], n: f64| list.iter().find(|p| p.0 == n).map_or(f64::NAN, |p| 100.0 * p.1);
-    writeln!(page.text, "## Figure 20: convergence\n\n‖gⁿ − g‖/‖g‖ of a bead at 20 µm after 8 and 48 iterations: {:.1} % and {:.1} % of the truth, {:.1} % and {:.1} % of the 64th iterate. The thesis states 0.675 % and does not say of which.\n", at(&to_truth, 8.0), at(&to_truth, 48.0), at(&to_last, 8.0), at(&to_last, 48.0))?;
+    writeln!(
+        page.text,
+        "## Figure 20: convergence\n\n‖gⁿ − g‖/‖g‖ of a bead at 20 µm after 8 and 48 iterations: {:.1} % and {:.1} % of the truth, {:.1} % and {:.1} % of the 64th iterate. The thesis states 0.675 % and does not say of which.\n",
+        at(&to_truth, 8.0),
+        at(&to_truth, 48.0),
+        at(&to_last, 8.0),
+        at(&to_last, 48.0)
+    )?;
     let series = vec![
         Series::new("against the truth", SeriesStyle::Line, to_truth),
         Series::new("against iterate 64", SeriesStyle::Line, to_last),
@@ -424,7 +457,10 @@ fn real_setup(page: &mut Page<'_>) -> Result<()> {
 fn main() -> Result<()> {
     let docs = std::env::args().nth(1).unwrap_or_else(|| "docs".to_owned());
     let mut page = Page { docs: Path::new(&docs), text: String::new() };
-    writeln!(page.text, "# Chapter 4 of the thesis: light field\n\nWritten by `cargo xtask reproduce lightfield`. Images are simulated with six voxels a lenslet, planes 2 µm apart and seven field samples a pixel, and reconstructed with three, 2.5 µm and five: no inverse crime. Richardson–Lucy, {ITERATIONS} iterations, box z = 0…40 µm with z = 0 in focus. `virtual`: the thesis' virtual point (4.8); `pupil`: the exact phase.\n")?;
+    writeln!(
+        page.text,
+        "# Chapter 4 of the thesis: light field\n\nWritten by `cargo xtask reproduce lightfield`. Images are simulated with six voxels a lenslet, planes 2 µm apart and seven field samples a pixel, and reconstructed with three, 2.5 µm and five: no inverse crime. Richardson–Lucy, {ITERATIONS} iterations, box z = 0…40 µm with z = 0 in focus. `virtual`: the thesis' virtual point (4.8); `pupil`: the exact phase.\n"
+    )?;
     angles(&mut page)?;
     seven(&mut page)?;
     depth_bits_noise(&mut page)?;

@@ -241,8 +241,14 @@ fn calibrate(a: &CalibrateArgs) -> Result<Answer, Error> {
     let mut text = String::new();
     let [x, y] = lattice.pitch_px;
     writeln!(text, "{:?} packing", lattice.packing).ok();
-    writeln!(text, "pitch     {:.5} ± {:.5} px along x, {:.5} ± {:.5} px along y", x.value, x.sigma, y.value, y.sigma).ok();
-    let mrad = |m: daic_lightfield::lattice::Measured| format!("{:.4} ± {:.4} mrad", 1e3 * m.value, 1e3 * m.sigma);
+    writeln!(
+        text,
+        "pitch     {:.5} ± {:.5} px along x, {:.5} ± {:.5} px along y",
+        x.value, x.sigma, y.value, y.sigma
+    )
+    .ok();
+    let mrad =
+        |m: daic_lightfield::lattice::Measured| format!("{:.4} ± {:.4} mrad", 1e3 * m.value, 1e3 * m.sigma);
     writeln!(text, "rotation  {}, skew {}", mrad(lattice.rotation_rad), mrad(lattice.skew_rad)).ok();
     let ([ox, oy], [sx, sy]) = (lattice.origin_px, lattice.origin_sigma_px);
     writeln!(text, "origin    ({ox:.4} ± {sx:.4}, {oy:.4} ± {sy:.4}) px").ok();

@@ -47,7 +47,9 @@ pub enum LightFieldError {
         reason: String,
     },
     /// Images of one order and not of the other.
-    #[error("a grating in the setup needs the images of both orders: {plus} of the first and {minus} of the second were given (--minus)")]
+    #[error(
+        "a grating in the setup needs the images of both orders: {plus} of the first and {minus} of the second were given (--minus)"
+    )]
     Orders {
         /// Images of the plus order.
         plus: usize,

@@ -61,10 +61,11 @@ impl FrameReader {
         let bad = read(&corrections.bad)?.map(|v| v.iter().map(|v| *v != 0.0).collect());
         let mut rectifier = None;
         if let Some(lattice) = &corrections.lattice {
-            let mut r = Rectifier::new(lattice, pixels, white.as_deref(), dark.as_deref()).map_err(|source| {
-                let path = corrections.white.clone().unwrap_or_default();
-                LightFieldError::Lattice { path, source }
-            })?;
+            let mut r =
+                Rectifier::new(lattice, pixels, white.as_deref(), dark.as_deref()).map_err(|source| {
+                    let path = corrections.white.clone().unwrap_or_default();
+                    LightFieldError::Lattice { path, source }
+                })?;
             if let Some([first, cells]) = corrections.crop {
                 r.crop(first, cells);
             }

@@ -58,14 +58,12 @@ pub fn read<H: DeserializeOwned>(path: &Path, magic: &[u8; 8]) -> Result<(H, Vec
     let number = |rest: &[u8]| -> Option<usize> {
         usize::try_from(u64::from_le_bytes(*rest.first_chunk::<8>()?)).ok()
     };
-    let (json, mut rest) =
-        number(rest).and_then(|n| rest.get(8..)?.split_at_checked(n)).ok_or_else(ends)?;
+    let (json, mut rest) = number(rest).and_then(|n| rest.get(8..)?.split_at_checked(n)).ok_or_else(ends)?;
     let header = serde_json::from_slice(json).map_err(|e| damaged(&format!("its header: {e}")))?;
     let mut arrays = Vec::new();
     while !rest.is_empty() {
-        let (values, after) = number(rest)
-            .and_then(|n| rest.get(8..)?.split_at_checked(n.checked_mul(4)?))
-            .ok_or_else(ends)?;
+        let (values, after) =
+            number(rest).and_then(|n| rest.get(8..)?.split_at_checked(n.checked_mul(4)?)).ok_or_else(ends)?;
         arrays.push(values.chunks_exact(4).map(|c| f32::from_le_bytes([c[0], c[1], c[2], c[3]])).collect());
         rest = after;
     }

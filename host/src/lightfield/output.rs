@@ -37,7 +37,12 @@ impl Format {
 ///
 /// # Errors
 /// A file that cannot be written.
-pub fn write(folder: &Path, name: &str, volume: &Volume<'_>, formats: &[Format]) -> Result<Vec<PathBuf>, Error> {
+pub fn write(
+    folder: &Path,
+    name: &str,
+    volume: &Volume<'_>,
+    formats: &[Format],
+) -> Result<Vec<PathBuf>, Error> {
     let mut written = Vec::new();
     for format in formats {
         let path = folder.join(format!("{name}.{}", format.ending()));
@@ -134,7 +139,9 @@ pub fn write_report(
         width: volume.shape[2],
         height: ny,
         values: volume.values.to_vec(),
-        labels: (0..volume.shape[0]).map(|z| format!("z = {:.2} µm", volume.first_um + z as f64 * dz)).collect(),
+        labels: (0..volume.shape[0])
+            .map(|z| format!("z = {:.2} µm", volume.first_um + z as f64 * dz))
+            .collect(),
         white: largest,
     };
     figures.push(Figure {

@@ -10,8 +10,8 @@ use crate::error::Error;
 use crate::progress::Progress;
 use daic_dataset::Volume;
 use daic_lightfield::{
-    Frame, MemoryEstimate, Method, Model, Normal, Operator, OperatorSettings, Psf, ReconstructError, Settings,
-    State, Storage, native_widths, reconstruct,
+    Frame, MemoryEstimate, Method, Model, Normal, Operator, OperatorSettings, Psf, ReconstructError,
+    Settings, State, Storage, native_widths, reconstruct,
 };
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -192,7 +192,8 @@ pub fn run(setup: &Setup, options: &Options, progress: &dyn Progress) -> Result<
     progress.stage(&format!("operator: {mib} MiB{tiles}"), 0);
     let model = model(&psf, &operator_settings, orders, &options.settings)?;
     for batch in left.chunks(options.batch.max(1)) {
-        let run = Batch { options, reader: &reader, cells, names: &names, key: &key, model: &model, psf: &psf };
+        let run =
+            Batch { options, reader: &reader, cells, names: &names, key: &key, model: &model, psf: &psf };
         let path = run.go(batch, &mut summary, progress)?;
         summary.path = path;
     }
@@ -436,7 +437,9 @@ fn finished(out: &Path, name: &str, key: &str, overwrite: bool) -> Result<Option
     match serde_json::from_slice::<Finished>(&text) {
         Ok(f) if f.key == key && f.done.files.iter().all(|p| p.exists()) => Ok(Some(f.done)),
         Ok(f) if f.key == key => Ok(None),
-        Ok(_) => Err(LightFieldError::State { path, reason: "it was made with other settings".to_owned() }.into()),
+        Ok(_) => {
+            Err(LightFieldError::State { path, reason: "it was made with other settings".to_owned() }.into())
+        }
         Err(e) => Err(LightFieldError::State { path, reason: e.to_string() }.into()),
     }
 }

@@ -102,8 +102,8 @@ impl Setup {
     /// # Errors
     /// The file and what is wrong with it.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|source| Error::Read { path: path.to_owned(), source })?;
+        let text =
+            std::fs::read_to_string(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
         Self::parse(&text).map_err(|reason| LightFieldError::Setup { path: path.to_owned(), reason }.into())
     }
 
@@ -128,7 +128,9 @@ impl Setup {
         let v = &self.volume;
         let steps = ((v.last_um - v.first_um) / v.step_um).round();
         if !(v.step_um.is_finite() && (0.0..4096.0).contains(&steps)) {
-            return Err(LightFieldError::Planes { first: v.first_um, last: v.last_um, step: v.step_um }.into());
+            return Err(
+                LightFieldError::Planes { first: v.first_um, last: v.last_um, step: v.step_um }.into()
+            );
         }
         let planes_um = (0..=steps as usize).map(|k| v.first_um + k as f64 * v.step_um).collect();
         let l = &self.lenslets;

@@ -46,7 +46,11 @@ fn environment() -> Result<PathBuf, String> {
     run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&dir))?;
     let package = format!("pyolaf=={PYOLAF}");
     run(Command::new(&python).args(["-m", "pip", "install", "--quiet"]).args(WITH).arg(&package))?;
-    if works(&python) { Ok(python) } else { Err(format!("pyolaf {PYOLAF} was installed but cannot be imported")) }
+    if works(&python) {
+        Ok(python)
+    } else {
+        Err(format!("pyolaf {PYOLAF} was installed but cannot be imported"))
+    }
 }
 
 /// The whole benchmark.
@@ -103,8 +107,12 @@ pub fn lightfield() -> Report {
             });
         }
     }
-    for (what, threads) in [("rl", 1), ("isra", 1), ("dlfm", 1), ("psf-plane", 1), ("rl", 2), ("isra", 2), ("size", 1)] {
-        report.step(&format!("ours: {what}, {threads} threads"), || outcome(ours(what, threads, &mut findings)));
+    for (what, threads) in
+        [("rl", 1), ("isra", 1), ("dlfm", 1), ("psf-plane", 1), ("rl", 2), ("isra", 2), ("size", 1)]
+    {
+        report.step(&format!("ours: {what}, {threads} threads"), || {
+            outcome(ours(what, threads, &mut findings))
+        });
     }
     report.step("docs/performance.md", || {
         let page = page(&findings);
@@ -143,7 +151,14 @@ fn page(f: &Findings) -> String {
         writeln!(out, "- {remark}").ok();
     }
     let base = peer("iterations", "15");
-    writeln!(out, "\npyolaf: point spread function {:.1} s, forward {:.2} s, back {:.2} s, 8 iterations {base:.1} s.\n", peer("psf", "15"), peer("forward", "15"), peer("back", "15")).ok();
+    writeln!(
+        out,
+        "\npyolaf: point spread function {:.1} s, forward {:.2} s, back {:.2} s, 8 iterations {base:.1} s.\n",
+        peer("psf", "15"),
+        peer("forward", "15"),
+        peer("back", "15")
+    )
+    .ok();
     writeln!(out, "| case | blocks | MiB | CPU, ms | smallest–largest | × less than pyolaf | per iteration, ms | GB/s | GFLOP/s | target | aim |").ok();
     writeln!(out, "|---|---|---|---|---|---|---|---|---|---|---|").ok();
     for (case, target, aim) in [
@@ -169,11 +184,12 @@ fn page(f: &Findings) -> String {
         let passes = if case.contains("normal") { 1.0 } else { 2.0 };
         // every stored number is used with as many real vectors as its orbit has
         let real = if case.ends_with("f16") { bytes / 2.0 } else { bytes / 4.0 };
-        let vectors = match reduction {
-            "RealSquare" => 8.0,
-            "RealMirrors" | "ComplexMirrorY" => 4.0,
-            _ => 2.0,
-        } * if case.starts_with("dlfm-rl") || case.starts_with("dlfm-isra-two") { 2.0 } else { 1.0 };
+        let vectors =
+            match reduction {
+                "RealSquare" => 8.0,
+                "RealMirrors" | "ComplexMirrorY" => 4.0,
+                _ => 2.0,
+            } * if case.starts_with("dlfm-rl") || case.starts_with("dlfm-isra-two") { 2.0 } else { 1.0 };
         let bandwidth = passes * bytes / each * 1e-9;
         let flops = 2.0 * passes * real * vectors / each * 1e-9;
         let span = format!("{}–{}", ms(get("cpu_low")), ms(get("cpu_high")));
@@ -189,7 +205,11 @@ fn page(f: &Findings) -> String {
     let ours = middle(&of(&f.ours, "case", "psf", None, "cpu"));
     let dlfm = middle(&of(&f.ours, "case", "psf-dlfm", None, "cpu"));
     writeln!(out, "\nPoint spread function at 75 field samples a lenslet: {ours:.2} s for 17 planes ({dlfm:.2} s of one order with the grating), one plane {plane:.3} s with its self-test; pyolaf at Nnum 75, one plane: {:.1} s, {:.0} times as much (target 5).\n", peer("psf", "75"), peer("psf", "75") / plane).ok();
-    writeln!(out, "| lenslets × lenslets × planes | MiB | CPU, ms | µs per lenslet and plane |\n|---|---|---|---|").ok();
+    writeln!(
+        out,
+        "| lenslets × lenslets × planes | MiB | CPU, ms | µs per lenslet and plane |\n|---|---|---|---|"
+    )
+    .ok();
     for line in f.ours.iter().filter(|l| l["case"].as_str().is_some_and(|c| c.contains('x'))) {
         let name = line["case"].as_str().unwrap_or_default().trim_start_matches("rl-f32-");
         let count: f64 = name.split('x').filter_map(|v| v.parse::<f64>().ok()).product();
@@ -211,7 +231,8 @@ fn load() -> String {
 pub fn reproduce() -> Report {
     let mut report = Report::default();
     report.step("chapter 4, light field", || {
-        let mut command = cargo(&["run", "--release", "--locked", "-p", "daic", "--example", "lightfield_thesis", "--"]);
+        let mut command =
+            cargo(&["run", "--release", "--locked", "-p", "daic", "--example", "lightfield_thesis", "--"]);
         command.arg(root().join("docs"));
         match command.status() {
             Ok(status) if status.success() => Outcome::Passed,

@@ -203,7 +203,11 @@ mod tests {
         let volume = Volume { shape: [3, 4, 5], values: &values, voxel_um: [2.5, 1.5, 1.0], first_um: -2.5 };
         for (name, word) in [("a.tif", "slices=3"), ("a.ome.tif", "PhysicalSizeZ=\"2.5\"")] {
             let path = dir.path().join(name);
-            if name.contains("ome") { volume.write_ome_tiff(&path).unwrap() } else { volume.write_tiff(&path).unwrap() }
+            if name.contains("ome") {
+                volume.write_ome_tiff(&path).unwrap()
+            } else {
+                volume.write_tiff(&path).unwrap()
+            }
             let mut decoder = Decoder::new(Cursor::new(fs::read(&path).unwrap())).unwrap();
             assert!(decoder.get_tag_ascii_string(Tag::ImageDescription).unwrap().contains(word));
             let mut all = Vec::new();

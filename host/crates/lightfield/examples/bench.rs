@@ -4,8 +4,8 @@
 //! Arguments: what is to be measured (`psf`, `rl`, `isra`, `dlfm`, `size`, `psf-plane`), threads, repeats.
 
 use daic_lightfield::{
-    DiffractionModel, Frame, Grating, Method, Model, Normal, Operator, OperatorSettings, Order, Oversampling, Psf,
-    PsfParameters, Radius, Settings, Storage, native_widths, reconstruct,
+    DiffractionModel, Frame, Grating, Method, Model, Normal, Operator, OperatorSettings, Order, Oversampling,
+    Psf, PsfParameters, Radius, Settings, Storage, native_widths, reconstruct,
 };
 use std::time::Instant;
 
@@ -79,7 +79,9 @@ fn time(case: &Case<'_>, repeats: usize) {
     let images: Vec<Vec<f32>> = (0..m.orders)
         .map(|o| match o {
             0 => image.clone(),
-            _ => image.chunks_exact(width).flat_map(|r| r.iter().rev().copied().collect::<Vec<_>>()).collect(),
+            _ => {
+                image.chunks_exact(width).flat_map(|r| r.iter().rev().copied().collect::<Vec<_>>()).collect()
+            }
         })
         .collect();
     let frame = [Frame { images: images.iter().map(Vec::as_slice).collect(), ..Frame::default() }];
@@ -172,7 +174,8 @@ fn run(what: &str, repeats: usize) {
             if what == "rl" {
                 let settings = OperatorSettings { use_symmetry: false, ..OperatorSettings::new(cells) };
                 let (model, build) = model(&psf, &settings, 1, false);
-                let case = Case { name: "rl-complex-f32", model, settings: Settings::new(Method::Rl, 8), build };
+                let case =
+                    Case { name: "rl-complex-f32", model, settings: Settings::new(Method::Rl, 8), build };
                 time(&case, repeats);
             }
         }
@@ -180,7 +183,9 @@ fn run(what: &str, repeats: usize) {
             // cost against lenslets and planes
             for (n, planes) in [(35, 17), (50, 17), (70, 17), (35, 9), (35, 31), (101, 31)] {
                 let p = PsfParameters {
-                    planes_um: (0..planes).map(|z| -20.0 + 40.0 * f64::from(z) / f64::from(planes - 1)).collect(),
+                    planes_um: (0..planes)
+                        .map(|z| -20.0 + 40.0 * f64::from(z) / f64::from(planes - 1))
+                        .collect(),
                     ..parameters(None)
                 };
                 let psf = Psf::compute(&p).expect("the published microscope");

@@ -18,10 +18,10 @@ mod psf;
 mod reconstruct;
 mod simd;
 
+pub use error::{LatticeError, OperatorError, PsfError, ReconstructError};
 pub use operator::{
     Direct, MemoryEstimate, Normal, Operator, OperatorSettings, Reduction, Storage, Symmetries,
 };
-pub use error::{LatticeError, OperatorError, PsfError, ReconstructError};
 pub use optics::{
     Aperture, DepthSign, DiffractionModel, Grating, Lenslets, Objective, Order, Oversampling, Packing,
     Propagation, PsfParameters, Radius, VoxelKernel,

@@ -74,13 +74,7 @@ pub struct Lenslets {
 impl Lenslets {
     /// Square, full lenslets with the sensor in their focal plane.
     pub fn square(pitch_um: f64, focal_um: f64) -> Self {
-        Self {
-            pitch_um,
-            focal_um,
-            gap_um: focal_um,
-            packing: Packing::Square,
-            aperture: Aperture::Full,
-        }
+        Self { pitch_um, focal_um, gap_um: focal_um, packing: Packing::Square, aperture: Aperture::Full }
     }
 
     /// Size (y, x) of the cell that repeats, µm.

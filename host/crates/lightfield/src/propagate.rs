@@ -3,7 +3,7 @@
 use crate::optics::Propagation;
 use rayon::prelude::*;
 use rustfft::num_complex::Complex64;
-use rustfft::{Fft, FftPlanner};
+use rustfft::{Fft, FftPlannerScalar};
 use std::sync::Arc;
 
 /// A periodic window of the lenslet plane, with what is needed to propagate fields on it.
@@ -31,7 +31,8 @@ impl Propagator {
         gap_um: f64,
         kind: Propagation,
     ) -> Self {
-        let mut planner = FftPlanner::new();
+        // vector instructions gain nothing at these lengths and take long to compile
+        let mut planner = FftPlannerScalar::new();
         let forward = size.map(|n| planner.plan_fft_forward(n));
         let inverse = size.map(|n| planner.plan_fft_inverse(n));
         let omega = [0, 1].map(|a| frequencies(size[a], spacing[a]));
@@ -72,8 +73,14 @@ impl Propagator {
     /// `[x][y]`, all rows.
     pub(crate) fn intensity(&self, field: &mut [Complex64], keep: std::ops::Range<usize>) -> Vec<f64> {
         let [ny, nx] = self.size;
-        let mut scratch =
-            vec![Complex64::default(); self.forward[1].get_inplace_scratch_len().max(self.forward[0].get_inplace_scratch_len()).max(self.inverse[1].get_inplace_scratch_len()).max(self.inverse[0].get_inplace_scratch_len())];
+        let mut scratch = vec![
+            Complex64::default();
+            self.forward[1]
+                .get_inplace_scratch_len()
+                .max(self.forward[0].get_inplace_scratch_len())
+                .max(self.inverse[1].get_inplace_scratch_len())
+                .max(self.inverse[0].get_inplace_scratch_len())
+        ];
         if let Some([ty, tx]) = &self.separable {
             for row in field.chunks_exact_mut(nx) {
                 self.forward[1].process_with_scratch(row, &mut scratch);

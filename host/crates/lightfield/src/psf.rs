@@ -214,8 +214,8 @@ impl<'a> Points<'a> {
         let cell = p.lenslets.cell_um();
         let half = (radius + p.guard) as f64 + 1.0;
         let far = shifts.iter().fold(0.0f64, |a, s| a.max(s.abs()));
-        let reach =
-            (half * cell[0] / p.objective.magnification).hypot(half * cell[1] / p.objective.magnification + far);
+        let reach = (half * cell[0] / p.objective.magnification)
+            .hypot(half * cell[1] / p.objective.magnification + far);
         // the pupil model needs no table
         let tables = if q.is_some() {
             DebyeTable { planes: Vec::new(), error: 0.0 }
@@ -228,9 +228,7 @@ impl<'a> Points<'a> {
     fn source(&self, z: usize) -> Source<'_> {
         match (self.q, self.tables.planes.get(z)) {
             (None, Some(field)) => Source::Radial { field, shift: self.shifts[z] },
-            (q, _) => {
-                Source::Pupil { q: q.unwrap_or(0.0), depth: self.p.depth.away(self.p.planes_um[z]) }
-            }
+            (q, _) => Source::Pupil { q: q.unwrap_or(0.0), depth: self.p.depth.away(self.p.planes_um[z]) },
         }
     }
 

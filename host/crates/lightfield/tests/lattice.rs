@@ -7,7 +7,14 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// A white image: soft discs on a lattice, vignetting, noise.
-fn white(size: [usize; 2], origin: [f64; 2], a: [f64; 2], b: [f64; 2], hexagonal: bool, seed: u64) -> Vec<f32> {
+fn white(
+    size: [usize; 2],
+    origin: [f64; 2],
+    a: [f64; 2],
+    b: [f64; 2],
+    hexagonal: bool,
+    seed: u64,
+) -> Vec<f32> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let det = a[0] * b[1] - a[1] * b[0];
     let pitch = a[0].hypot(a[1]);
@@ -49,7 +56,10 @@ fn a_square_lattice_is_found() {
         (lattice.along_y_px[0], lattice.sides_sigma_px[1][0], b[0]),
         (lattice.along_y_px[1], lattice.sides_sigma_px[1][1], b[1]),
     ] {
-        assert!((found - truth).abs() < 1e-3 && (found - truth).abs() < 5.0 * sigma + 1e-5, "{found} {truth} {sigma}");
+        assert!(
+            (found - truth).abs() < 1e-3 && (found - truth).abs() < 5.0 * sigma + 1e-5,
+            "{found} {truth} {sigma}"
+        );
     }
     let [u, v] = lattice.cell_of(origin);
     assert!((u - u.round()).abs() < 1e-3 && (v - v.round()).abs() < 1e-3, "{u} {v}");
@@ -92,7 +102,10 @@ fn frames_are_rectified() {
     let mean = lights.iter().sum::<f64>() / 132.0;
     let worst = lights.iter().map(|l| (l / mean - 1.0).abs()).fold(0.0, f64::max);
     let total: f64 = image.iter().map(|v| f64::from(*v)).sum::<f64>() / image.len() as f64;
-    println!("worst cell {worst:.4}, light per cell {mean:.0}, mean of the image times area {:.0}", total * lattice.cell_area());
+    println!(
+        "worst cell {worst:.4}, light per cell {mean:.0}, mean of the image times area {:.0}",
+        total * lattice.cell_area()
+    );
     assert!(worst < 0.01, "{worst}");
     // every cell looks the same on both sides of its centre
     let mut odd = 0.0;

@@ -3,7 +3,8 @@
 mod common;
 use common::{f32s, f64s, relative, shared};
 use daic_lightfield::{
-    Direct, Operator, OperatorSettings, Oversampling, Psf, PsfParameters, PsfReport, Radius, Reduction, Storage,
+    Direct, Operator, OperatorSettings, Oversampling, Psf, PsfParameters, PsfReport, Radius, Reduction,
+    Storage,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -109,7 +110,15 @@ const CASES: [Case; 9] = {
         Case { symmetry: Reduction::ComplexMirrorY, planes: 3, margin: -1, cells: [6, 5], ..base },
         Case { symmetry: Reduction::ComplexMirrorX, pixels: [5, 6], voxels: [3, 2], cells: [5, 7], ..base },
         Case { symmetry: Reduction::Complex, pixels: [3, 9], voxels: [2, 1], planes: 5, margin: 1, ..base },
-        Case { symmetry: Reduction::Complex, pixels: [2, 3], voxels: [1, 1], planes: 1, radius: 0, cells: [1, 1], ..base },
+        Case {
+            symmetry: Reduction::Complex,
+            pixels: [2, 3],
+            voxels: [1, 1],
+            planes: 1,
+            radius: 0,
+            cells: [1, 1],
+            ..base
+        },
     ]
 };
 
@@ -133,7 +142,11 @@ fn projections_are_those_of_the_plain_sums() {
                 (0..3).map(|_| random(&mut rng, operator.image_shape().iter().product())).collect();
             let refs = |v: &'static str, list: &[Vec<f32>]| -> Vec<Vec<f32>> {
                 let list: Vec<&[f32]> = list.iter().map(Vec::as_slice).collect();
-                if v == "g" { operator.project(&list).unwrap() } else { operator.back_project(&list).unwrap() }
+                if v == "g" {
+                    operator.project(&list).unwrap()
+                } else {
+                    operator.back_project(&list).unwrap()
+                }
             };
             let (hg, htf) = (refs("g", &g), refs("f", &f));
             for i in 0..3 {
@@ -164,7 +177,9 @@ fn tiles_give_the_same() {
     let seed = 21;
     println!("seed {seed}");
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    for (margin, symmetry) in [(0, Reduction::RealSquare), (2, Reduction::Complex), (-1, Reduction::ComplexMirrorY)] {
+    for (margin, symmetry) in
+        [(0, Reduction::RealSquare), (2, Reduction::Complex), (-1, Reduction::ComplexMirrorY)]
+    {
         let case = Case { cells: [11, 13], margin, symmetry, ..CASES[0] };
         let psf = symmetric(&mut rng, &case);
         let settings = OperatorSettings { margin, ..OperatorSettings::new(case.cells) };

@@ -51,7 +51,8 @@ fn both_orders_of_a_grating() {
     let Some(dir) = shared("psf_dlfm", "golden/lightfield") else { return };
     for (order, name) in [(Order::Plus, "H_plus_f32.npy"), (Order::Minus, "H_minus_f32.npy")] {
         let grating = Grating { pitch_um: 0.9, order, model: DiffractionModel::Virtual };
-        let psf = Psf::compute(&PsfParameters { allow_under_sampling: true, ..golden(4, Some(grating)) }).unwrap();
+        let psf =
+            Psf::compute(&PsfParameters { allow_under_sampling: true, ..golden(4, Some(grating)) }).unwrap();
         let truth = f32s(dir.join(name));
         let error = relative(psf.values.iter().map(|&v| f64::from(v)), truth.iter().map(|&v| f64::from(v)));
         println!("{name} {error:.2e} {:?}", psf.report);
@@ -132,14 +133,20 @@ fn conventions_and_refusals() {
     let p = PsfParameters::thesis(vec![0.0]);
     let grating = |pitch_um| Some(Grating { pitch_um, order: Order::Plus, model: DiffractionModel::Pupil });
     let error = |p: PsfParameters| Psf::compute(&p).unwrap_err();
-    assert!(matches!(error(PsfParameters { grating: grating(0.4), ..p.clone() }), PsfError::Evanescent { .. }));
+    assert!(matches!(
+        error(PsfParameters { grating: grating(0.4), ..p.clone() }),
+        PsfError::Evanescent { .. }
+    ));
     let objective = Objective { na: 1.2, ..p.objective };
     assert!(matches!(error(PsfParameters { objective, ..p.clone() }), PsfError::Aperture { .. }));
     let tight = Radius::Energy { share: 0.999, max: 1 };
     let deep = PsfParameters { radius: tight, oversampling: Oversampling::Samples(5), ..p.clone() };
     let deep = PsfParameters { planes_um: vec![20.0], ..deep };
     assert!(matches!(error(deep), PsfError::Spread { max: 1, .. }));
-    assert!(matches!(error(PsfParameters { planes_um: vec![], ..p.clone() }), PsfError::Count { what: "planes", .. }));
+    assert!(matches!(
+        error(PsfParameters { planes_um: vec![], ..p.clone() }),
+        PsfError::Count { what: "planes", .. }
+    ));
     assert!(matches!(error(PsfParameters { planes_um: vec![f64::NAN], ..p }), PsfError::Plane { .. }));
 }
 

@@ -53,7 +53,10 @@ impl ImageStack {
                 }
             }
             let png = encode_png(&self.title, width, height, rgba)?;
-            pictures.push(format!("data:image/png;base64,{}", base64::engine::general_purpose::STANDARD.encode(png)));
+            pictures.push(format!(
+                "data:image/png;base64,{}",
+                base64::engine::general_purpose::STANDARD.encode(png)
+            ));
         }
         let middle = pictures.len() / 2;
         let data = serde_json::json!({ "planes": pictures, "labels": self.labels });

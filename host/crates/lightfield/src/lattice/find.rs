@@ -4,8 +4,8 @@ use super::{Lattice, Measured};
 use crate::error::LatticeError;
 use crate::optics::Packing;
 use rayon::prelude::*;
-use rustfft::FftPlanner;
-use rustfft::num_complex::{Complex32, Complex64};
+use rustfft::FftPlannerScalar;
+use rustfft::num_complex::Complex64;
 
 /// Smallest side of an image.
 const LEAST: usize = 64;
@@ -35,11 +35,9 @@ pub fn find(
         return Err(LatticeError::Small { width, height, least: LEAST });
     }
     for (what, image) in [("the white image", Some(white)), ("the dark image", dark)] {
-        if let Some(image) = image {
-            if image.len() != width * height {
-                let (found_width, found_height) = (image.len() / height, height);
-                return Err(LatticeError::Size { what, found_width, found_height, width, height });
-            }
+        if let Some(image) = image.filter(|i| i.len() != width * height) {
+            let (found_width, found_height) = (image.len() / height, height);
+            return Err(LatticeError::Size { what, found_width, found_height, width, height });
         }
     }
     if let Some(level) = saturation {
@@ -53,7 +51,7 @@ pub fn find(
         None => white.to_vec(),
     };
     let mean = light.iter().map(|v| f64::from(*v)).sum::<f64>() / light.len() as f64;
-    if !(mean > 0.0) {
+    if mean.is_nan() || mean <= 0.0 {
         return Err(LatticeError::Dark);
     }
     let (packing, waves) = periods(&light, size)?;
@@ -110,7 +108,8 @@ fn periods(light: &[f32], size: [usize; 2]) -> Result<(Packing, [[f64; 2]; 2]), 
     let none = |contrast| LatticeError::NoPattern { contrast, needed: CONTRAST };
     let &(strongest, ..) = peaks.first().ok_or(none(0.0))?;
     // among the strong ones the longest period is the basic one
-    let strong: Vec<&(f64, isize, isize)> = peaks.iter().take(24).filter(|p| p.0 > 0.25 * strongest).collect();
+    let strong: Vec<&(f64, isize, isize)> =
+        peaks.iter().take(24).filter(|p| p.0 > 0.25 * strongest).collect();
     let length = |p: &(f64, isize, isize)| (p.1 as f64).hypot(p.2 as f64);
     let first = strong.iter().min_by(|a, b| length(a).total_cmp(&length(b))).ok_or(none(0.0))?;
     let contrast = first.0 / ring(length(first));
@@ -158,21 +157,20 @@ fn periods(light: &[f32], size: [usize; 2]) -> Result<(Packing, [[f64; 2]; 2]), 
 /// Amplitudes of the spectrum of the middle of an image under a Hann window.
 fn amplitude(light: &[f32], size: [usize; 2], n: usize) -> Vec<f32> {
     let (x0, y0) = ((size[0] - n) / 2, (size[1] - n) / 2);
-    let window: Vec<f32> = (0..n)
-        .map(|i| (std::f64::consts::PI * (i as f64 + 0.5) / n as f64).sin().powi(2) as f32)
-        .collect();
+    let window: Vec<f32> =
+        (0..n).map(|i| (std::f64::consts::PI * (i as f64 + 0.5) / n as f64).sin().powi(2) as f32).collect();
     let mean = light.iter().map(|v| f64::from(*v)).sum::<f64>() / light.len() as f64;
-    let mut field: Vec<Complex32> = (0..n * n)
+    let mut field: Vec<Complex64> = (0..n * n)
         .map(|i| {
             let (y, x) = (i / n, i % n);
             let v = light[(y0 + y) * size[0] + x0 + x] - mean as f32;
-            Complex32::new(v * window[x] * window[y], 0.0)
+            Complex64::new(f64::from(v * window[x] * window[y]), 0.0)
         })
         .collect();
-    let fft = FftPlanner::new().plan_fft_forward(n);
+    let fft = FftPlannerScalar::new().plan_fft_forward(n);
     for _ in 0..2 {
         field.par_chunks_mut(n).for_each(|row| fft.process(row));
-        let mut turned = vec![Complex32::default(); n * n];
+        let mut turned = vec![Complex64::default(); n * n];
         for y in 0..n {
             for x in 0..n {
                 turned[x * n + y] = field[y * n + x];
@@ -180,7 +178,7 @@ fn amplitude(light: &[f32], size: [usize; 2], n: usize) -> Vec<f32> {
         }
         field = turned;
     }
-    field.iter().map(|c| c.norm()).collect()
+    field.iter().map(|c| c.norm() as f32).collect()
 }
 
 /// Cell sides of wave vectors: k_i · a_j = 2π δ_ij.
@@ -221,7 +219,8 @@ fn centre(light: &[f32], size: [usize; 2], at: [f64; 2], sides: [[f64; 2]; 2]) -
             .collect()
     };
     let (xs, ys) = (axis(0), axis(1));
-    let phases = waves.map(|w| xs.iter().map(|(d, g)| Complex64::from_polar(*g, -w[0] * d)).collect::<Vec<_>>());
+    let phases =
+        waves.map(|w| xs.iter().map(|(d, g)| Complex64::from_polar(*g, -w[0] * d)).collect::<Vec<_>>());
     let mut sums = [Complex64::default(); 2];
     let mut total = 0.0;
     let first = (middle[0] - reach) as usize;
@@ -263,10 +262,8 @@ fn fit_lattice(
     let most = (size[0].max(size[1]) as f64 * 1.5 / shortest) as usize;
     let n = reach.min(most) as isize;
     let n = n - n % stride as isize;
-    let cells: Vec<(isize, isize)> = (-n..=n)
-        .step_by(stride)
-        .flat_map(|j| (-n..=n).step_by(stride).map(move |i| (i, j)))
-        .collect();
+    let cells: Vec<(isize, isize)> =
+        (-n..=n).step_by(stride).flat_map(|j| (-n..=n).step_by(stride).map(move |i| (i, j))).collect();
     let found: Vec<([f64; 2], [f64; 2], f64)> = cells
         .par_iter()
         .filter_map(|&(i, j)| {
@@ -295,7 +292,8 @@ fn fit_lattice(
         };
         let mut distances: Vec<f64> = list.iter().map(|&(a, b)| distance(&(a, b, 0.0))).collect();
         let square: [f64; 2] = [0, 1].map(|k| {
-            let sum: f64 = list.iter().map(|(c, x)| (x[k] - p[k][0] - c[0] * p[k][1] - c[1] * p[k][2]).powi(2)).sum();
+            let sum: f64 =
+                list.iter().map(|(c, x)| (x[k] - p[k][0] - c[0] * p[k][1] - c[1] * p[k][2]).powi(2)).sum();
             sum / (list.len() as f64 - 3.0)
         });
         distances.sort_by(f64::total_cmp);
@@ -334,7 +332,7 @@ fn least_squares(list: &[([f64; 2], [f64; 2])]) -> Option<([[f64; 3]; 2], [f64; 
         let r: Vec<usize> = (0..3).filter(|i| *i != a).collect();
         let c: Vec<usize> = (0..3).filter(|i| *i != b).collect();
         let v = m[r[0]][c[0]] * m[r[1]][c[1]] - m[r[0]][c[1]] * m[r[1]][c[0]];
-        if (a + b) % 2 == 0 { v } else { -v }
+        if (a + b).is_multiple_of(2) { v } else { -v }
     };
     let det = (0..3).map(|b| m[0][b] * minor(0, b)).sum::<f64>();
     if det.abs() < 1e-9 {

@@ -59,7 +59,8 @@ impl Rectifier {
         for (axis, k) in [(1, 0), (0, 1)] {
             let [low, high] = self.range[axis];
             let start = low + first[k] as isize;
-            self.range[axis] = [start.min(high), (start + cells[k] as isize - 1).clamp(start.min(high), high)];
+            self.range[axis] =
+                [start.min(high), (start + cells[k] as isize - 1).clamp(start.min(high), high)];
         }
     }
 
@@ -151,17 +152,26 @@ pub fn cell_gains(lattice: &Lattice, white: &[f32], dark: Option<&[f32]>) -> Res
     let least = [0, 1].map(|k| corners.iter().map(|c| c[k]).fold(f64::INFINITY, f64::min).floor() - 1.0);
     let most = [0, 1].map(|k| corners.iter().map(|c| c[k]).fold(f64::NEG_INFINITY, f64::max).ceil() + 1.0);
     let count = [0, 1].map(|k| (most[k] - least[k]) as usize + 1);
-    let mut sums = vec![(0f64, 0usize); count[0] * count[1]];
-    for i in 0..width * height {
-        let [u, v] = place(i);
-        let at = (v.round() - least[1]) as usize * count[0] + (u.round() - least[0]) as usize;
-        sums[at].0 += f64::from(white[i] - dark.map_or(0.0, |d| d[i]));
-        sums[at].1 += 1;
-    }
-    // a part of a cell has another mean than the whole: cells cut by the border take that of their neighbours
-    let enough = (0.97 * lattice.cell_area()) as usize;
-    let mut means: Vec<Option<f64>> =
-        sums.iter().map(|&(s, n)| (n > enough && s > 0.0).then(|| s / n as f64)).collect();
+    let light: Vec<f32> = (0..width * height).map(|i| white[i] - dark.map_or(0.0, |d| d[i])).collect();
+    // places spread evenly over a cell: counting whole pixels would weigh the dark rim by chance
+    let steps = [0, 1].map(|k| (2.0 * lattice.pitch_px[k].value).ceil().max(1.0) as usize);
+    let mean = |cell: usize| -> Option<f64> {
+        let (u, v) = ((cell % count[0]) as f64 + least[0], (cell / count[0]) as f64 + least[1]);
+        let mut sum = 0.0;
+        for j in 0..steps[1] {
+            for i in 0..steps[0] {
+                let [s, t] = [(i, steps[0]), (j, steps[1])].map(|(i, n)| (i as f64 + 0.5) / n as f64 - 0.5);
+                let p = lattice.at(u + s, v + t);
+                // cells cut by the border take the mean of their neighbours
+                if p[0] < 0.0 || p[1] < 0.0 || p[0] > (width - 1) as f64 || p[1] > (height - 1) as f64 {
+                    return None;
+                }
+                sum += f64::from(sample(&light, None, width, height, p).0);
+            }
+        }
+        (sum > 0.0).then(|| sum / (steps[0] * steps[1]) as f64)
+    };
+    let mut means: Vec<Option<f64>> = (0..count[0] * count[1]).into_par_iter().map(mean).collect();
     let mut sorted: Vec<f64> = means.iter().flatten().copied().collect();
     sorted.sort_by(f64::total_cmp);
     let median = *sorted.get(sorted.len() / 2).ok_or(LatticeError::Dark)?;

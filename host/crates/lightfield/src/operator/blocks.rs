@@ -264,7 +264,8 @@ impl Kernel {
             .par_iter()
             .enumerate()
             .flat_map_iter(|(kx, list)| {
-                let mut sums = vec![(vec![0f32; size], vec![0f32; size]); if list.is_empty() { 0 } else { side }];
+                let mut sums =
+                    vec![(vec![0f32; size], vec![0f32; size]); if list.is_empty() { 0 } else { side }];
                 for (dy, (re, im)) in sums.iter_mut().enumerate() {
                     for dx in 0..side {
                         let (cos, sin) = phase(kx, dx, px);
@@ -324,7 +325,8 @@ pub(crate) fn pack<T: Element>(
     let mut factor = 1.0f32;
     if T::BYTES == 2 {
         // the largest number of half precision is 65504
-        let largest = matrices.iter().flat_map(|(a, b)| a.iter().chain(b)).fold(0.0f32, |m, v| m.max(v.abs()));
+        let largest =
+            matrices.iter().flat_map(|(a, b)| a.iter().chain(b)).fold(0.0f32, |m, v| m.max(v.abs()));
         if largest > 0.0 {
             factor = 2f32.powi((16384.0 / largest).log2().floor() as i32);
             scale /= factor;

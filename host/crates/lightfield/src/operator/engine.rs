@@ -72,6 +72,9 @@ pub(crate) struct Spectra {
     columns: Vec<f32>,
 }
 
+/// Work on a row of cells: (row, its numbers, its part of the state).
+type RowWork<'a> = dyn Fn(usize, &mut [f32], &mut [f32]) + Sync + 'a;
+
 /// Everything but the blocks.
 pub(crate) struct Engine {
     pub(crate) grid: [usize; 2],
@@ -116,7 +119,7 @@ impl Engine {
         back: bool,
         forth: bool,
         state: &mut [f32],
-        work: impl Fn(usize, &mut [f32], &mut [f32]) + Sync,
+        work: &RowWork<'_>,
     ) {
         let row = side.row();
         let spectrum = self.half() * 2 * side.padded;
@@ -159,10 +162,11 @@ impl Engine {
         } else {
             state.chunks_mut(2 * row).collect()
         };
-        row_parts.par_iter_mut().zip(state_parts.par_iter_mut()).enumerate().for_each_init(
-            Vec::new,
-            |values, (pair, (rows, state))| task(pair, rows, state, values),
-        );
+        row_parts
+            .par_iter_mut()
+            .zip(state_parts.par_iter_mut())
+            .enumerate()
+            .for_each_init(Vec::new, |values, (pair, (rows, state))| task(pair, rows, state, values));
     }
 
     /// From the transformed rows of `from` to the columns of `to`, for several frames; `adjoint` applies the
@@ -190,31 +194,56 @@ impl Engine {
         for f in frames.iter_mut() {
             f.products.resize(count * slot, 0.0);
         }
-        let (planes, mut products): (Vec<&[f32]>, Vec<_>) =
-            frames.iter_mut().map(|Spectra { plane, products, .. }| (&**plane, products.chunks_mut(slot))).unzip();
+        let (planes, mut products): (Vec<&[f32]>, Vec<_>) = frames
+            .iter_mut()
+            .map(|Spectra { plane, products, .. }| (&**plane, products.chunks_mut(slot)))
+            .unzip();
         // products of an orbit, of all frames
-        let mut parts: Vec<Vec<&mut [f32]>> = (0..count)
-            .map(|_| products.iter_mut().filter_map(|p| p.next()).collect())
-            .collect();
+        let mut parts: Vec<Vec<&mut [f32]>> =
+            (0..count).map(|_| products.iter_mut().filter_map(|p| p.next()).collect()).collect();
         let chunk = count.div_ceil(64).max(1);
-        parts.par_chunks_mut(chunk).enumerate().for_each_init(BlockScratch::default, |scratch, (c, parts)| {
-            let first = c * chunk;
-            run(
-                self.level,
-                Multiply { engine: self, blocks, from, to, adjoint, planes: &planes, first, parts, scratch },
-            );
-        });
+        parts.par_chunks_mut(chunk).enumerate().for_each_init(
+            BlockScratch::default,
+            |scratch, (c, parts)| {
+                let first = c * chunk;
+                run(
+                    self.level,
+                    Multiply {
+                        engine: self,
+                        blocks,
+                        from,
+                        to,
+                        adjoint,
+                        planes: &planes,
+                        first,
+                        parts,
+                        scratch,
+                    },
+                );
+            },
+        );
         for f in frames.iter_mut() {
             let rows = to.side.cells[0];
             f.columns.resize(half * rows * wide_to, 0.0);
             let Spectra { products, columns, .. } = f;
             let products: &[f32] = products;
-            columns.par_chunks_mut(rows * wide_to).enumerate().for_each_init(Vec::new, |scratch, (kx, out)| {
-                run(
-                    self.level,
-                    ColumnBack { engine: self, port: to, products, out, kx, scratch, scale: blocks.scale },
-                );
-            });
+            columns.par_chunks_mut(rows * wide_to).enumerate().for_each_init(
+                Vec::new,
+                |scratch, (kx, out)| {
+                    run(
+                        self.level,
+                        ColumnBack {
+                            engine: self,
+                            port: to,
+                            products,
+                            out,
+                            kx,
+                            scratch,
+                            scale: blocks.scale,
+                        },
+                    );
+                },
+            );
         }
     }
 }
@@ -267,11 +296,7 @@ impl Work for RowForth<'_> {
                 |g| match side.cell_at(1, g, n) {
                     Some(x) => {
                         let at = x * c + channel;
-                        let im = if count > 1 {
-                            part(s, second, at)
-                        } else {
-                            V::splat(s, 0.0)
-                        };
+                        let im = if count > 1 { part(s, second, at) } else { V::splat(s, 0.0) };
                         C { re: part(s, first, at), im }
                     }
                     None => C::zero(s),
@@ -376,10 +401,7 @@ impl Work for ColumnForth<'_> {
                 |g| match side.cell_at(0, g, n) {
                     Some(y) => {
                         let at = y * row + kx * 2 * c + channel;
-                        C {
-                            re: part(s, rows, at),
-                            im: part(s, rows, at + c),
-                        }
+                        C { re: part(s, rows, at), im: part(s, rows, at + c) }
                     }
                     None => C::zero(s),
                 },
@@ -435,10 +457,7 @@ impl Work for ColumnBack<'_> {
                 #[inline(always)]
                 |k| {
                     let at = k * wide + channel;
-                    C {
-                        re: part(s, column, at),
-                        im: part(s, column, at + c),
-                    }
+                    C { re: part(s, column, at), im: part(s, column, at + c) }
                 },
             );
             for y in 0..side.cells[0] {
@@ -529,7 +548,9 @@ impl<T: Element> Work for Multiply<'_, '_, T> {
                     let out = &mut part[f][m * 2 * padded_to..][..2 * padded_to];
                     let (re, im) = out.split_at_mut(padded_to);
                     if adjoint {
-                        for ((re, im), v) in re.iter_mut().zip(im).take(channels_to).zip(y.chunks_exact(VECTORS)) {
+                        for ((re, im), v) in
+                            re.iter_mut().zip(im).take(channels_to).zip(y.chunks_exact(VECTORS))
+                        {
                             *re = v[2 * j];
                             *im = v[2 * j + 1];
                         }

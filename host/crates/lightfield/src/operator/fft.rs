@@ -27,7 +27,7 @@ struct Stage {
 pub(crate) fn good_length(n: usize) -> usize {
     let smooth = |mut k: usize| {
         for f in [2, 3, 5] {
-            while k % f == 0 {
+            while k.is_multiple_of(f) {
                 k /= f;
             }
         }
@@ -136,7 +136,7 @@ impl Plan {
     pub(crate) fn new(n: usize) -> Self {
         let (mut rest, mut stride, mut stages) = (n, 1, Vec::new());
         for radix in [5, 4, 3, 2] {
-            while rest % radix == 0 {
+            while rest.is_multiple_of(radix) {
                 let m = rest / radix;
                 let twiddles = (0..m)
                     .flat_map(|p| (1..radix).map(move |k| (p * k) as f64 / (radix * m) as f64))
@@ -167,27 +167,33 @@ impl Plan {
         scratch: &mut [f32],
         load: impl Fn(usize) -> C<S>,
     ) {
-        let (result, other) = scratch[..self.scratch()].split_at_mut(self.n * PART);
-        let count = self.stages.len();
-        if count == 0 {
-            put(result, 0, load(0));
+        let scratch = &mut scratch[..self.scratch()];
+        let (result, other) = scratch.split_at_mut(self.n * PART);
+        // the last stage writes into `result`
+        let input = if self.stages.len().is_multiple_of(2) { result } else { other };
+        for i in 0..self.n {
+            put(input, i, load(i));
         }
-        for (i, stage) in self.stages.iter().enumerate() {
-            // the last stage writes into `result`
-            let to_result = (count - i) % 2 == 1;
-            if i == 0 {
-                let to = if to_result { &mut *result } else { &mut *other };
-                stage.run::<S, INVERSE>(s, &load, to);
-            } else {
-                let (from, to) = if to_result { (&*other, &mut *result) } else { (&*result, &mut *other) };
-                stage.run::<S, INVERSE>(
-                    s,
-                    #[inline(always)]
-                    |i| get(s, from, i),
-                    to,
-                );
-            }
-        }
+        self.stages_on::<S, INVERSE>(s, scratch);
+    }
+
+    /// All stages; a function of its own, as every caller's copy would take long to compile.
+    #[inline(never)]
+    fn stages_on<S: Simd, const INVERSE: bool>(&self, s: S, scratch: &mut [f32]) {
+        s.vectorize(
+            #[inline(always)]
+            || {
+                let (result, other) = scratch.split_at_mut(self.n * PART);
+                let count = self.stages.len();
+                for (i, stage) in self.stages.iter().enumerate() {
+                    if (count - i) % 2 == 1 {
+                        stage.run::<S, INVERSE>(s, other, result);
+                    } else {
+                        stage.run::<S, INVERSE>(s, result, other);
+                    }
+                }
+            },
+        );
     }
 }
 
@@ -199,17 +205,36 @@ pub(crate) fn result<S: Simd>(s: S, scratch: &[f32], i: usize) -> C<S> {
 
 impl Stage {
     #[inline(always)]
-    fn run<S: Simd, const INVERSE: bool>(
-        &self,
-        s: S,
-        load: impl Fn(usize) -> C<S>,
-        to: &mut [f32],
-    ) {
+    fn run<S: Simd, const INVERSE: bool>(&self, s: S, from: &[f32], to: &mut [f32]) {
         match self.radix {
-            2 => self.pass::<S, 2, INVERSE>(s, load, to, #[inline(always)] |x| dft2(x)),
-            3 => self.pass::<S, 3, INVERSE>(s, load, to, #[inline(always)] |x| dft3::<S, INVERSE>(s, x)),
-            4 => self.pass::<S, 4, INVERSE>(s, load, to, #[inline(always)] |x| dft4::<S, INVERSE>(x)),
-            _ => self.pass::<S, 5, INVERSE>(s, load, to, #[inline(always)] |x| dft5::<S, INVERSE>(s, x)),
+            2 => self.pass::<S, 2, INVERSE>(
+                s,
+                from,
+                to,
+                #[inline(always)]
+                |x| dft2(x),
+            ),
+            3 => self.pass::<S, 3, INVERSE>(
+                s,
+                from,
+                to,
+                #[inline(always)]
+                |x| dft3::<S, INVERSE>(s, x),
+            ),
+            4 => self.pass::<S, 4, INVERSE>(
+                s,
+                from,
+                to,
+                #[inline(always)]
+                |x| dft4::<S, INVERSE>(x),
+            ),
+            _ => self.pass::<S, 5, INVERSE>(
+                s,
+                from,
+                to,
+                #[inline(always)]
+                |x| dft5::<S, INVERSE>(s, x),
+            ),
         }
     }
 
@@ -217,7 +242,7 @@ impl Stage {
     fn pass<S: Simd, const R: usize, const INVERSE: bool>(
         &self,
         s: S,
-        load: impl Fn(usize) -> C<S>,
+        from: &[f32],
         to: &mut [f32],
         dft: impl Fn([C<S>; R]) -> [C<S>; R],
     ) {
@@ -225,7 +250,7 @@ impl Stage {
             for q in 0..self.stride {
                 let mut x = [C::zero(s); R];
                 for k in 0..R {
-                    x[k] = load(q + self.stride * (p + self.m * k));
+                    x[k] = get(s, from, q + self.stride * (p + self.m * k));
                 }
                 let y = dft(x);
                 put(to, q + self.stride * R * p, y[0]);

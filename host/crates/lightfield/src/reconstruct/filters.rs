@@ -51,10 +51,8 @@ pub(super) fn variation(layout: &Layout, packed: &[f32], weight: f32, voxel_um: 
         let length = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + floor * floor).sqrt();
         d.map(|d| d / length)
     };
-    let units: Vec<[f32; 3]> = (0..nz * ny * nx)
-        .into_par_iter()
-        .map(|i| unit(i / (ny * nx), i / nx % ny, i % nx))
-        .collect();
+    let units: Vec<[f32; 3]> =
+        (0..nz * ny * nx).into_par_iter().map(|i| unit(i / (ny * nx), i / nx % ny, i % nx)).collect();
     let factors: Vec<f32> = (0..units.len())
         .into_par_iter()
         .map(|i| {
@@ -87,8 +85,7 @@ pub(super) fn smooth_planes(layout: &Layout, packed: &mut [f32], widths: &[f64],
             return;
         }
         let reach = (3.0 * sigma).ceil() as isize;
-        let kernel: Vec<f64> =
-            (-reach..=reach).map(|i| (-0.5 * (i as f64 / sigma).powi(2)).exp()).collect();
+        let kernel: Vec<f64> = (-reach..=reach).map(|i| (-0.5 * (i as f64 / sigma).powi(2)).exp()).collect();
         let line = |from: &[f32]| -> Vec<f32> {
             let n = from.len() as isize;
             (0..n)

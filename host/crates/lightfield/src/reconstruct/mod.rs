@@ -8,7 +8,7 @@
 //!
 //! Thesis (4.10), with its G⁻¹ read as the transpose, is ISRA, the least-squares relative of Richardson–Lucy.
 //! Two first orders add up in numerator and denominator. Denominators are not let below 1e-12, estimates of
-//! pixels not below the operator's rounding noise (1e-7 of the brightest pixel, 1e-4 in half precision), and
+//! pixels not below the operator's rounding noise (1e-7 of the brightest pixel, 1e-5 in half precision), and
 //! voxels of which the sensor sees less than 1e-6 of what it sees of the best are set to zero.
 
 mod filters;
@@ -217,15 +217,15 @@ pub fn reconstruct(
             Some(all(f.background.as_ref().unwrap_or(&plain)))
         });
     }
-    if let Some(level) = settings.saturation.filter(|_| settings.mask_saturated) {
-        if images.iter().flatten().any(|&v| v >= level) {
-            let weights = weights.get_or_insert_with(|| {
-                let ones = sensor.pack(&vec![1f32; model.operator.image_shape().iter().product()]);
-                vec![ones; images.len()]
-            });
-            for (w, image) in weights.iter_mut().zip(&images) {
-                w.iter_mut().zip(image).filter(|(_, v)| **v >= level).for_each(|(w, _)| *w = 0.0);
-            }
+    if let Some(level) = settings.saturation.filter(|_| settings.mask_saturated)
+        && images.iter().flatten().any(|&v| v >= level)
+    {
+        let weights = weights.get_or_insert_with(|| {
+            let ones = sensor.pack(&vec![1f32; model.operator.image_shape().iter().product()]);
+            vec![ones; images.len()]
+        });
+        for (w, image) in weights.iter_mut().zip(&images) {
+            w.iter_mut().zip(image).filter(|(_, v)| **v >= level).for_each(|(w, _)| *w = 0.0);
         }
     }
     for v in images.iter_mut().flatten() {
@@ -234,15 +234,13 @@ pub fn reconstruct(
     let squares: Vec<f64> = images.iter().map(|i| i.iter().map(|v| f64::from(*v).powi(2)).sum()).collect();
 
     let rounding = model.operator.rounding();
-    let floors: Vec<f32> = images
-        .iter()
-        .map(|i| (rounding * i.iter().copied().fold(0.0f32, f32::max)).max(FLOOR))
-        .collect();
+    let floors: Vec<f32> =
+        images.iter().map(|i| (rounding * i.iter().copied().fold(0.0f32, f32::max)).max(FLOOR)).collect();
     let mut passes = Passes::new(model, frames.len());
     let path = choose(model, settings, weights.is_some());
     let normal = if path == Path::Normal { model.normal.as_ref() } else { None };
     // Hᵀw for Richardson–Lucy, Hᵀ(w (f − b)) for ISRA
-    let fixed = passes.back_project(&volume, |image, row, values| {
+    let fixed = passes.back_project(&volume, &|image, row, values| {
         let at = row * sensor.row()..(row + 1) * sensor.row();
         if settings.method == Method::Rl {
             match &weights {
@@ -267,7 +265,7 @@ pub fn reconstruct(
         (Method::Rl, _) => fixed.clone(),
         // a sensor that catches all light sees every voxel
         (Method::Isra, Path::Normal) => vec![vec![1f32; volume.len()]; frames.len()],
-        (Method::Isra, Path::TwoPasses { .. }) => passes.back_project(&volume, |image, row, values| {
+        (Method::Isra, Path::TwoPasses { .. }) => passes.back_project(&volume, &|image, row, values| {
             let at = row * sensor.row()..(row + 1) * sensor.row();
             match &weights {
                 Some(w) => values.copy_from_slice(&w[image][at]),
@@ -318,7 +316,7 @@ pub fn reconstruct(
             points.iter().map(|x| filters::variation(&volume, x, weight, model.voxel_um)).collect()
         });
         if normal.is_none() {
-            let rows = passes.forward(&points, |image, row, values| {
+            let rows = passes.forward(&points, &|image, row, values| {
                 let at = row * sensor.row()..(row + 1) * sensor.row();
                 let f = &images[image][at.clone()];
                 let b = background.as_ref().map(|b| &b[image][at.clone()]);
@@ -332,7 +330,7 @@ pub fn reconstruct(
             }
         }
         let old = if plain { Vec::new() } else { points.clone() };
-        let rows = passes.update(normal, &mut points, plain && !last, |frame, row, values, x| {
+        let rows = passes.update(normal, &mut points, plain && !last, &|frame, row, values, x| {
             let at = row * volume.row()..(row + 1) * volume.row();
             let tv = variation.as_ref().map(|v| &v[frame][at.clone()]);
             voxels(settings.method, values, &factors[frame][at], tv, x)
@@ -508,7 +506,9 @@ fn check(
         for list in lists.into_iter().flatten() {
             if list.len() != model.orders {
                 let (found, expected) = (list.len(), model.orders);
-                return Err(OperatorError::Length { what: "a frame's list of orders", found, expected }.into());
+                return Err(
+                    OperatorError::Length { what: "a frame's list of orders", found, expected }.into()
+                );
             }
             for (image, values) in list.iter().enumerate() {
                 model.operator.geometry.check_image(values.len())?;
@@ -528,11 +528,11 @@ fn check(
                 let (x, y, value) = (i % width, i / width, values[i]);
                 return Err(ReconstructError::Negative { image, count, x, y, value });
             }
-            if let Some(level) = settings.saturation.filter(|_| !settings.mask_saturated) {
-                if let Some((i, count)) = bad(&|v| v >= level) {
-                    let (x, y) = (i % width, i / width);
-                    return Err(ReconstructError::Saturated { image, count, level, x, y });
-                }
+            if let Some(level) = settings.saturation.filter(|_| !settings.mask_saturated)
+                && let Some((i, count)) = bad(&|v| v >= level)
+            {
+                let (x, y) = (i % width, i / width);
+                return Err(ReconstructError::Saturated { image, count, level, x, y });
             }
             if values.iter().all(|v| *v <= 0.0) {
                 return Err(ReconstructError::Dark { image });

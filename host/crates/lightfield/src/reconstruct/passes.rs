@@ -5,6 +5,9 @@ use crate::operator::{Form, Layout, Normal, Spectra};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+/// Work on a row of voxels: (frame, row, what came back, the volume's row); returns two sums.
+pub(super) type VoxelWork<'a> = dyn Fn(usize, usize, &mut [f32], &mut [f32]) -> (f64, f64) + Sync + 'a;
+
 /// Spectra, or in tiles plain images, of all frames and orders.
 pub(super) struct Passes<'a> {
     model: &'a Model,
@@ -43,14 +46,16 @@ impl<'a> Passes<'a> {
     pub(super) fn back_project(
         &mut self,
         volume: &Layout,
-        pixel: impl Fn(usize, usize, &mut [f32]) + Sync,
+        pixel: &(dyn Fn(usize, usize, &mut [f32]) + Sync),
     ) -> Vec<Vec<f32>> {
         let [_, sensor] = self.model.operator.layouts();
         match &self.model.operator.form {
             Form::Whole(whole) => {
                 for (image, s) in self.spectra.iter_mut().enumerate() {
                     let side = &whole.sensor.side;
-                    whole.engine.turn(side, s, false, true, &mut [], |row, values, _| pixel(image, row, values));
+                    whole
+                        .engine
+                        .turn(side, s, false, true, &mut [], &|row, values, _| pixel(image, row, values));
                 }
             }
             Form::Tiled(_) => {
@@ -62,7 +67,7 @@ impl<'a> Passes<'a> {
             }
         }
         let mut out = vec![vec![0f32; volume.len()]; self.spectra.len() / self.orders];
-        self.update(None, &mut out, false, |_, _, values, x| {
+        self.update(None, &mut out, false, &|_, _, values, x| {
             x.copy_from_slice(values);
             (0.0, 0.0)
         });
@@ -73,7 +78,7 @@ impl<'a> Passes<'a> {
     pub(super) fn forward(
         &mut self,
         xs: &[Vec<f32>],
-        pixel: impl Fn(usize, usize, &mut [f32]) -> f64 + Sync,
+        pixel: &(dyn Fn(usize, usize, &mut [f32]) -> f64 + Sync),
     ) -> Vec<Vec<f64>> {
         let [volume, sensor] = self.model.operator.layouts();
         let orders = self.orders;
@@ -83,7 +88,7 @@ impl<'a> Passes<'a> {
                 if !self.prepared {
                     for (image, s) in self.spectra.iter_mut().enumerate() {
                         let x = &xs[image / orders];
-                        whole.engine.turn(&whole.volume.side, s, false, true, &mut [], |row, values, _| {
+                        whole.engine.turn(&whole.volume.side, s, false, true, &mut [], &|row, values, _| {
                             own_row(&volume, x, row, image % orders, values);
                         });
                     }
@@ -91,7 +96,7 @@ impl<'a> Passes<'a> {
                 whole.forward(&mut self.spectra);
                 for (image, s) in self.spectra.iter_mut().enumerate() {
                     let sums = Sums::new(sensor.cells[0]);
-                    whole.engine.turn(&whole.sensor.side, s, true, true, &mut [], |row, values, _| {
+                    whole.engine.turn(&whole.sensor.side, s, true, true, &mut [], &|row, values, _| {
                         sums.set(row, pixel(image, row, values));
                     });
                     out.push(sums.take());
@@ -122,7 +127,7 @@ impl<'a> Passes<'a> {
         normal: Option<&Normal>,
         xs: &mut [Vec<f32>],
         go_on: bool,
-        voxel: impl Fn(usize, usize, &mut [f32], &mut [f32]) -> (f64, f64) + Sync,
+        voxel: &VoxelWork<'_>,
     ) -> Vec<Vec<(f64, f64)>> {
         let [volume, _] = self.model.operator.layouts();
         let orders = self.orders;
@@ -132,7 +137,7 @@ impl<'a> Passes<'a> {
             let frames = &mut self.spectra[..xs.len()];
             if !self.prepared {
                 for (s, x) in frames.iter_mut().zip(xs.iter()) {
-                    normal.engine.turn(&normal.volume.side, s, false, true, &mut [], |row, values, _| {
+                    normal.engine.turn(&normal.volume.side, s, false, true, &mut [], &|row, values, _| {
                         own_row(&volume, x, row, 0, values);
                     });
                 }
@@ -140,7 +145,7 @@ impl<'a> Passes<'a> {
             normal.apply(frames);
             for (frame, (s, x)) in frames.iter_mut().zip(xs).enumerate() {
                 let sums = [Sums::new(count), Sums::new(count)];
-                normal.engine.turn(&normal.volume.side, s, true, go_on, x, |row, values, x| {
+                normal.engine.turn(&normal.volume.side, s, true, go_on, x, &|row, values, x| {
                     let (a, b) = voxel(frame, row, values, x);
                     sums[0].set(row, a);
                     sums[1].set(row, b);
@@ -161,12 +166,12 @@ impl<'a> Passes<'a> {
                     let mut mirrored = Vec::new();
                     if let [second] = second {
                         mirrored.resize(volume.len(), 0.0);
-                        engine.turn(side, second, true, false, &mut mirrored, |_, values, out| {
+                        engine.turn(side, second, true, false, &mut mirrored, &|_, values, out| {
                             volume.mirror_row(values, out);
                         });
                     }
                     let sums = [Sums::new(count), Sums::new(count)];
-                    engine.turn(side, &mut first[0], true, go_on, x, |row, values, x| {
+                    engine.turn(side, &mut first[0], true, go_on, x, &|row, values, x| {
                         if let Some(other) = mirrored.get(row * volume.row()..(row + 1) * volume.row()) {
                             for (v, o) in values.iter_mut().zip(other) {
                                 *v += o;
@@ -181,7 +186,7 @@ impl<'a> Passes<'a> {
                     out.push(a.into_iter().zip(b).collect());
                     if let ([second], true) = (second, go_on) {
                         let x = &*x;
-                        engine.turn(side, second, false, true, &mut [], |row, values, _| {
+                        engine.turn(side, second, false, true, &mut [], &|row, values, _| {
                             own_row(&volume, x, row, 1, values);
                         });
                     }
@@ -194,7 +199,9 @@ impl<'a> Passes<'a> {
                     if let Some(second) = images.get(1) {
                         let other = tiles.through(second, false);
                         let mut row = vec![0f32; volume.row()];
-                        for (to, from) in back.chunks_exact_mut(volume.row()).zip(other.chunks_exact(volume.row())) {
+                        for (to, from) in
+                            back.chunks_exact_mut(volume.row()).zip(other.chunks_exact(volume.row()))
+                        {
                             volume.mirror_row(from, &mut row);
                             for (v, o) in to.iter_mut().zip(&row) {
                                 *v += o;
