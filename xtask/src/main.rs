@@ -18,15 +18,14 @@ cargo xtask COMMAND
   ci         test, then lint
   figures    draws the pictures of README and docs anew with the program itself
   coverage   2 000 simulated calibrations: what the stated uncertainties cover (minutes)
-  reproduce  macro: chapter 2 of the thesis, micro: chapter 3, simulated and measured, into
-             docs/reproduction.md
+  reproduce  macro: chapter 2 of the thesis, micro: chapter 3, lightfield: chapter 4 (about an
+             hour), simulated and measured, into docs/reproduction.md
   hil        --faults N: N more runs of the fault campaign; totals in docs/campaigns/faults.json
              --verifier [--long]: 10 000 (1 000 000) random programs through the verifier
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders
              lightfield: speed and memory beside pyolaf, into docs/performance.md
              guard [--update]: instruction counts against the baseline (or: makes a new one)
-  reproduce  lightfield: chapter 4 of the thesis, figures and tables into docs/
 ";
 
 fn main() -> ExitCode {
@@ -42,7 +41,7 @@ fn main() -> ExitCode {
         }
         ["figures"] => steps::figures(),
         ["coverage"] => steps::coverage(),
-        ["reproduce", chapter @ ("macro" | "micro")] => steps::reproduce(chapter),
+        ["reproduce", chapter @ ("macro" | "micro" | "lightfield")] => steps::reproduce(chapter),
         ["hil", "--faults", count] if count.parse::<u64>().is_ok() => {
             campaign::faults(count.parse().unwrap_or(0))
         }
@@ -51,7 +50,6 @@ fn main() -> ExitCode {
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),
         ["bench", "lightfield"] => bench::lightfield::lightfield(),
-        ["reproduce", "lightfield"] => bench::lightfield::reproduce(),
         ["bench", "optics"] => steps::bench_optics(),
         ["bench", "guard"] => bench::guard::step(false),
         ["bench", "guard", "--update"] => bench::guard::step(true),

@@ -143,13 +143,16 @@ struct ReconstructArgs {
     /// Smooth each plane as coarsely as the lenslets sample it; factor of the width
     #[arg(long, value_name = "FACTOR", default_value_t = 0.0)]
     anti_artefact: f64,
+    /// Background in every pixel, in counts: what is not from the volume
+    #[arg(long, value_name = "COUNTS", default_value_t = 0.0, value_parser = parse_background)]
+    background: f32,
     /// Variance of the read noise, in counts
     #[arg(long, value_name = "V", default_value_t = 0.0)]
     read_variance: f32,
     /// Leave saturated pixels out instead of refusing the frame
     #[arg(long)]
     mask_saturated: bool,
-    /// Take negative pixels for 0 instead of refusing the frame (always so with --dark)
+    /// Take negative pixels for 0 instead of refusing the frame (always so with --dark and --lattice)
     #[arg(long)]
     clip_negative: bool,
     /// Lenslets around the sensor from which light may come too
@@ -173,6 +176,11 @@ struct ReconstructArgs {
     /// Say what memory it would take, and stop
     #[arg(long)]
     estimate: bool,
+}
+
+fn parse_background(text: &str) -> Result<f32, String> {
+    let value: f32 = text.parse().map_err(|e| format!("{e}"))?;
+    if value >= 0.0 && value.is_finite() { Ok(value) } else { Err("a number from 0 on is needed".to_owned()) }
 }
 
 fn parse_crop(text: &str) -> Result<[[usize; 2]; 2], String> {
@@ -288,8 +296,8 @@ fn reconstruct(a: &ReconstructArgs, output: &Output) -> Result<Answer, Error> {
             total_variation: a.total_variation,
             anti_artefact: a.anti_artefact,
             read_variance: a.read_variance,
-            // noise about a dark level has both signs
-            clip_negative: a.clip_negative || a.dark.is_some(),
+            // noise about a dark level has both signs, and so has cubic interpolation beside a bright spot
+            clip_negative: a.clip_negative || a.dark.is_some() || a.lattice.is_some(),
             ..Settings::new(
                 match a.method {
                     MethodArg::Rl => Method::Rl,
@@ -298,6 +306,7 @@ fn reconstruct(a: &ReconstructArgs, output: &Output) -> Result<Answer, Error> {
                 a.iterations,
             )
         },
+        background: a.background,
         border: a.border,
         storage: match a.storage {
             StorageArg::F32 => Storage::F32,

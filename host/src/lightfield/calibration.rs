@@ -52,8 +52,9 @@ pub fn read(path: &Path) -> Result<Lattice, Error> {
         std::fs::read_to_string(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
     let bad = |reason: String| LightFieldError::LatticeFile { path: path.to_owned(), reason };
     let lattice: Lattice = toml::from_str(&text).map_err(|e| bad(e.to_string().trim_end().to_owned()))?;
-    let finite = lattice.origin_px.iter().chain(&lattice.along_x_px).chain(&lattice.along_y_px);
-    if finite.clone().any(|v| !v.is_finite()) || !(lattice.cell_area() >= 4.0) {
+    let mut numbers = lattice.origin_px.iter().chain(&lattice.along_x_px).chain(&lattice.along_y_px);
+    // not comparable is not enough either
+    if numbers.any(|v| !v.is_finite()) || lattice.cell_area().total_cmp(&4.0).is_lt() {
         return Err(bad("its cell has less than 4 pixels".to_owned()).into());
     }
     Ok(lattice)

@@ -74,6 +74,12 @@ impl FrameReader {
         Ok(Self { pixels, corrections, rectifier, dark, bad })
     }
 
+    /// Area of a pixel of a corrected frame, in pixels of the camera.
+    pub fn area(&self) -> f32 {
+        let [ny, nx] = self.pixels;
+        self.corrections.lattice.as_ref().map_or(1.0, |l| (l.cell_area() / (ny * nx) as f64) as f32)
+    }
+
     /// Reads and corrects a frame.
     ///
     /// # Errors

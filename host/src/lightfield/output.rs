@@ -129,7 +129,14 @@ pub fn write_report(
         figures.push(Figure {
             id: format!("mip-{suffix}"),
             title: heatmap.title.clone(),
-            caption: "maximum-intensity projection; the colour bar gives the reconstructed values".into(),
+            caption: format!(
+                "maximum-intensity projection, {}; the colour bar gives the reconstructed values",
+                match suffix {
+                    "xy" => "x to the right, y down",
+                    "xz" => "x to the right, z down",
+                    _ => "z to the right, y down",
+                }
+            ),
             body: heatmap.render_svg()?,
         });
     }

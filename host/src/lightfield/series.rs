@@ -34,6 +34,8 @@ pub struct Options {
     pub corrections: Corrections,
     /// How volumes are reconstructed.
     pub settings: Settings,
+    /// Level of the background in every pixel of the camera, part of the model; dark image taken off before.
+    pub background: f32,
     /// Cells around the sensor in which light may start too; they are cut off afterwards.
     pub border: usize,
     /// Storage of the operator.
@@ -95,6 +97,7 @@ pub struct Done {
 struct Key<'a> {
     parameters: &'a daic_lightfield::PsfParameters,
     settings: &'a Settings,
+    background: f32,
     border: usize,
     storage: Storage,
     lattice: &'a Option<daic_lightfield::lattice::Lattice>,
@@ -166,6 +169,7 @@ pub fn run(setup: &Setup, options: &Options, progress: &dyn Progress) -> Result<
     let key = hash(&Key {
         parameters: &parameters,
         settings: &options.settings,
+        background: options.background,
         border: options.border,
         storage: options.storage,
         lattice: &options.corrections.lattice,
@@ -260,6 +264,7 @@ impl Batch<'_> {
             images.push(list);
         }
         let ones: Vec<f32> = vec![1.0; images[0][0].values.len()];
+        let level: Vec<f32> = vec![self.options.background * self.reader.area(); ones.len()];
         let frames: Vec<Frame<'_>> = images
             .iter()
             .map(|list| Frame {
@@ -268,7 +273,7 @@ impl Batch<'_> {
                     .iter()
                     .any(|f| f.weights.is_some())
                     .then(|| list.iter().map(|f| f.weights.as_deref().unwrap_or(&ones)).collect()),
-                background: None,
+                background: (self.options.background > 0.0).then(|| vec![level.as_slice(); list.len()]),
             })
             .collect();
         let (states, before) = self.states(batch)?;

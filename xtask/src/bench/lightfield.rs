@@ -2,7 +2,7 @@
 //! section of docs/performance.md.
 
 use super::{lines, outcome, replace_section};
-use crate::steps::{Outcome, Report, cargo, root};
+use crate::steps::{Outcome, Report, root};
 use serde_json::Value;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -225,20 +225,4 @@ fn page(f: &Findings) -> String {
 fn load() -> String {
     let text = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
     text.split_whitespace().next().unwrap_or("unknown").to_owned()
-}
-
-/// `cargo xtask reproduce lightfield`: chapter 4 of the thesis as figures and tables.
-pub fn reproduce() -> Report {
-    let mut report = Report::default();
-    report.step("chapter 4, light field", || {
-        let mut command =
-            cargo(&["run", "--release", "--locked", "-p", "daic", "--example", "lightfield_thesis", "--"]);
-        command.arg(root().join("docs"));
-        match command.status() {
-            Ok(status) if status.success() => Outcome::Passed,
-            Ok(status) => Outcome::Failed(status.to_string()),
-            Err(error) => Outcome::Failed(format!("{command:?} did not start: {error}")),
-        }
-    });
-    report
 }

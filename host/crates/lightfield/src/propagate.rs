@@ -69,73 +69,96 @@ impl Propagator {
         Self { size, forward, inverse, separable, full }
     }
 
-    /// Propagates `field` (`[y][x]`, overwritten) and returns |field|² of the columns `keep`, transposed:
-    /// `[x][y]`, all rows.
-    pub(crate) fn intensity(&self, field: &mut [Complex64], keep: std::ops::Range<usize>) -> Vec<f64> {
+    /// Propagates the field of the buffers (`[y][x]`, overwritten) and hands the columns `keep` of the result to
+    /// `column`, each as (place in `keep`, samples of all rows).
+    pub(crate) fn propagate(
+        &self,
+        buffers: &mut Buffers,
+        keep: std::ops::Range<usize>,
+        mut column: impl FnMut(usize, &[Complex64]),
+    ) {
         let [ny, nx] = self.size;
-        let mut scratch = vec![
-            Complex64::default();
-            self.forward[1]
-                .get_inplace_scratch_len()
-                .max(self.forward[0].get_inplace_scratch_len())
-                .max(self.inverse[1].get_inplace_scratch_len())
-                .max(self.inverse[0].get_inplace_scratch_len())
-        ];
+        let Buffers { field, band, scratch } = buffers;
+        let plans = self.forward.iter().chain(&self.inverse);
+        let needed = plans.map(|p| p.get_inplace_scratch_len()).max().unwrap_or(0);
+        scratch.resize(needed, Complex64::default());
+        band.resize(BAND * ny, Complex64::default());
+        let convolve =
+            |a: usize, line: &mut [Complex64], transfer: &[Complex64], scratch: &mut [Complex64]| {
+                self.forward[a].process_with_scratch(line, scratch);
+                for (v, t) in line.iter_mut().zip(transfer) {
+                    *v *= t;
+                }
+                self.inverse[a].process_with_scratch(line, scratch);
+            };
         if let Some([ty, tx]) = &self.separable {
             for row in field.chunks_exact_mut(nx) {
-                self.forward[1].process_with_scratch(row, &mut scratch);
-                for (v, t) in row.iter_mut().zip(tx) {
-                    *v *= t;
-                }
-                self.inverse[1].process_with_scratch(row, &mut scratch);
+                convolve(1, row, tx, scratch);
             }
-            let mut columns = transpose(field, ny, nx, keep);
-            for column in columns.chunks_exact_mut(ny) {
-                self.forward[0].process_with_scratch(column, &mut scratch);
-                for (v, t) in column.iter_mut().zip(ty) {
-                    *v *= t;
+            for first in keep.clone().step_by(BAND) {
+                let count = BAND.min(keep.end - first);
+                cut(field, nx, first, count, band);
+                for (i, line) in band.chunks_exact_mut(ny).take(count).enumerate() {
+                    convolve(0, line, ty, scratch);
+                    column(first + i - keep.start, line);
                 }
-                self.inverse[0].process_with_scratch(column, &mut scratch);
             }
-            return columns.iter().map(Complex64::norm_sqr).collect();
+            return;
         }
         for row in field.chunks_exact_mut(nx) {
-            self.forward[1].process_with_scratch(row, &mut scratch);
+            self.forward[1].process_with_scratch(row, scratch);
         }
-        let mut columns = transpose(field, ny, nx, 0..nx);
-        for (column, t) in columns.chunks_exact_mut(ny).zip(self.full.chunks_exact(ny)) {
-            self.forward[0].process_with_scratch(column, &mut scratch);
-            for (v, t) in column.iter_mut().zip(t) {
-                *v *= t;
+        for first in (0..nx).step_by(BAND) {
+            let count = BAND.min(nx - first);
+            cut(field, nx, first, count, band);
+            for (i, line) in band.chunks_exact_mut(ny).take(count).enumerate() {
+                convolve(0, line, &self.full[(first + i) * ny..][..ny], scratch);
             }
-            self.inverse[0].process_with_scratch(column, &mut scratch);
-        }
-        let mut rows = transpose(&columns, nx, ny, 0..ny);
-        for row in rows.chunks_exact_mut(nx) {
-            self.inverse[1].process_with_scratch(row, &mut scratch);
-        }
-        let kept = transpose(&rows, ny, nx, keep);
-        kept.iter().map(Complex64::norm_sqr).collect()
-    }
-}
-
-/// Columns `keep` of a matrix of `rows` × `columns`, as rows.
-fn transpose(m: &[Complex64], rows: usize, columns: usize, keep: std::ops::Range<usize>) -> Vec<Complex64> {
-    const TILE: usize = 16;
-    let mut out = vec![Complex64::default(); keep.len() * rows];
-    for y in (0..rows).step_by(TILE) {
-        for x in (0..keep.len()).step_by(TILE) {
-            for b in x..(x + TILE).min(keep.len()) {
-                for a in y..(y + TILE).min(rows) {
-                    out[b * rows + a] = m[a * columns + keep.start + b];
+            for (y, row) in field.chunks_exact_mut(nx).enumerate() {
+                for (i, v) in row[first..first + count].iter_mut().enumerate() {
+                    *v = band[i * ny + y];
                 }
             }
         }
+        for row in field.chunks_exact_mut(nx) {
+            self.inverse[1].process_with_scratch(row, scratch);
+        }
+        for first in keep.clone().step_by(BAND) {
+            let count = BAND.min(keep.end - first);
+            cut(field, nx, first, count, band);
+            for (i, line) in band.chunks_exact(ny).take(count).enumerate() {
+                column(first + i - keep.start, line);
+            }
+        }
     }
-    out
 }
 
-/// Runs `work` for each item in parallel, results in order.
-pub(crate) fn each<T: Sync, R: Send>(items: &[T], work: impl Fn(&T) -> R + Sync + Send) -> Vec<R> {
-    items.par_iter().map(work).collect()
+/// Columns worked on together.
+const BAND: usize = 16;
+
+/// Buffers of a thread: fields are large, and new memory for each would cost more than its transforms.
+#[derive(Default)]
+pub(crate) struct Buffers {
+    /// The field, `[y][x]`.
+    pub(crate) field: Vec<Complex64>,
+    band: Vec<Complex64>,
+    scratch: Vec<Complex64>,
+}
+
+/// Copies columns of a matrix, one after the other, into a band.
+fn cut(field: &[Complex64], width: usize, first: usize, count: usize, band: &mut [Complex64]) {
+    let height = band.len() / BAND;
+    for (y, row) in field.chunks_exact(width).enumerate() {
+        for (i, v) in row[first..first + count].iter().enumerate() {
+            band[i * height + y] = *v;
+        }
+    }
+}
+
+/// Runs `work` for each item in parallel, results in order; a thread's buffers serve many items.
+pub(crate) fn each<T: Sync, R: Send>(
+    items: &[T],
+    work: impl Fn(&mut Buffers, &T) -> R + Sync + Send,
+) -> Vec<R> {
+    items.par_iter().map_init(Buffers::default, work).collect()
 }

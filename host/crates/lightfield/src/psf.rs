@@ -4,7 +4,7 @@ use crate::debye::{DebyeTable, RadialField, pupil_field};
 use crate::error::PsfError;
 use crate::lenslets::transmission;
 use crate::optics::{DiffractionModel, Order, Oversampling, Packing, PsfParameters, Radius, VoxelKernel};
-use crate::propagate::{Propagator, each};
+use crate::propagate::{Buffers, Propagator, each};
 use rustfft::num_complex::Complex64;
 use serde::{Deserialize, Serialize};
 
@@ -137,11 +137,12 @@ impl Window {
         (0..n * self.cells()).map(|i| (first + i as f64) * self.spacing[axis]).collect()
     }
 
-    /// Light in the pixels within the radius, `[dy][dx][ny][nx]`, of a field in front of the lenslets.
-    fn pixels(&self, mut field: Vec<Complex64>) -> Vec<f64> {
+    /// Light in the pixels within the radius, `[dy][dx][ny][nx]`, of the field in front of the lenslets that the
+    /// buffers hold.
+    fn pixels(&self, buffers: &mut Buffers) -> Vec<f64> {
         let [sy, sx] = self.samples;
         let width = sx * self.cells();
-        for (y, row) in field.chunks_exact_mut(width).enumerate() {
+        for (y, row) in buffers.field.chunks_exact_mut(width).enumerate() {
             let lens = &self.lenslets[(y % sy) * sx..][..sx];
             for part in row.chunks_exact_mut(sx) {
                 for (v, l) in part.iter_mut().zip(lens) {
@@ -150,19 +151,19 @@ impl Window {
             }
         }
         let keep = self.guard * sx..(self.guard + 2 * self.radius + 1) * sx;
-        let light = self.propagator.intensity(&mut field, keep);
         let side = 2 * self.radius + 1;
-        let height = sy * self.cells();
         let [ny, nx] = [sy / self.over, sx / self.over];
         let mut out = vec![0.0; side * side * ny * nx];
         let area = self.spacing[0] * self.spacing[1];
-        for (x, column) in light.chunks_exact(height).enumerate() {
+        self.propagator.propagate(buffers, keep, |x, column| {
             let (dx, px) = (x / sx, x % sx / self.over);
-            for (y, v) in column[self.guard * sy..][..side * sy].iter().enumerate() {
-                let (dy, py) = (y / sy, y % sy / self.over);
-                out[((dy * side + dx) * ny + py) * nx + px] += v * area;
+            let rows = column[self.guard * sy..][..side * sy].chunks_exact(self.over);
+            for (row, samples) in rows.enumerate() {
+                let (dy, py) = (row / ny, row % ny);
+                let light: f64 = samples.iter().map(Complex64::norm_sqr).sum();
+                out[((dy * side + dx) * ny + py) * nx + px] += light * area;
             }
-        }
+        });
         out
     }
 }
@@ -265,33 +266,40 @@ impl<'a> Points<'a> {
     }
 
     /// Light of a sub-point of a plane of [`Points::pupil_plane`].
-    fn light_of(window: &Window, plane: &Plane, at: [usize; 2]) -> Vec<f64> {
+    fn light_of(window: &Window, plane: &Plane, at: [usize; 2], buffers: &mut Buffers) -> Vec<f64> {
         let [height, width] = [0, 1].map(|a| window.samples[a] * window.cells());
         let (y0, x0) = (plane.shifts[0][at[0]], plane.shifts[1][at[1]]);
-        let mut out = Vec::with_capacity(height * width);
+        buffers.field.clear();
         for y in 0..height {
-            out.extend_from_slice(&plane.field[(y0 + y) * plane.width + x0..][..width]);
+            buffers.field.extend_from_slice(&plane.field[(y0 + y) * plane.width + x0..][..width]);
         }
-        window.pixels(out)
+        window.pixels(buffers)
     }
 
     /// Light of sub-point (z, y, x) in the pixels.
-    fn light(&self, window: &Window, z: usize, at: [usize; 2]) -> Result<Vec<f64>, PsfError> {
+    fn light(
+        &self,
+        window: &Window,
+        z: usize,
+        at: [usize; 2],
+        buffers: &mut Buffers,
+    ) -> Result<Vec<f64>, PsfError> {
         let m = self.p.objective.magnification;
         let xs: Vec<f64> = window.positions(1).iter().map(|x| x / m - self.position(1, at[1])).collect();
         let ys: Vec<f64> = window.positions(0).iter().map(|y| y / m - self.position(0, at[0])).collect();
-        let field = match self.source(z) {
+        match self.source(z) {
             Source::Radial { field, shift } => {
                 let squares: Vec<f64> = xs.iter().map(|x| (x - shift) * (x - shift)).collect();
-                let mut out = Vec::with_capacity(xs.len() * ys.len());
+                buffers.field.clear();
                 for y in &ys {
-                    out.extend(squares.iter().map(|s| field.at((s + y * y).sqrt())));
+                    buffers.field.extend(squares.iter().map(|s| field.at((s + y * y).sqrt())));
                 }
-                out
             }
-            Source::Pupil { q, depth } => pupil_field(&self.p.objective, q, depth, &xs, &ys)?.0,
-        };
-        Ok(window.pixels(field))
+            Source::Pupil { q, depth } => {
+                buffers.field = pupil_field(&self.p.objective, q, depth, &xs, &ys)?.0;
+            }
+        }
+        Ok(window.pixels(buffers))
     }
 }
 
@@ -335,10 +343,10 @@ impl Psf {
             // one field serves all sub-points of a plane
             for z in 0..p.planes_um.len() {
                 let plane = points.pupil_plane(&window, z, fine)?;
-                let part = each(&unique, |&at| {
+                let part = each(&unique, |buffers, &at| {
                     let light = match &plane {
-                        Some(plane) => Ok(Points::light_of(&window, plane, at)),
-                        None => points.light(&window, z, at),
+                        Some(plane) => Ok(Points::light_of(&window, plane, at, buffers)),
+                        None => points.light(&window, z, at, buffers),
                     };
                     count();
                     light
@@ -350,8 +358,8 @@ impl Psf {
         } else {
             let jobs: Vec<(usize, [usize; 2])> =
                 (0..p.planes_um.len()).flat_map(|z| unique.iter().map(move |&at| (z, at))).collect();
-            let part = each(&jobs, |&(z, at)| {
-                let light = points.light(&window, z, at);
+            let part = each(&jobs, |buffers, &(z, at)| {
+                let light = points.light(&window, z, at, buffers);
                 count();
                 light
             });
@@ -636,7 +644,7 @@ fn sampling(p: &PsfParameters) -> Result<(usize, f64), PsfError> {
     };
     let points = Points::new(&trial, 2)?;
     let light = |over: usize| -> Result<Vec<f64>, PsfError> {
-        points.light(&Window::new(&trial, over, 2)?, 0, [0, 0])
+        points.light(&Window::new(&trial, over, 2)?, 0, [0, 0], &mut Buffers::default())
     };
     let mut over = start;
     loop {
@@ -676,8 +684,8 @@ fn radii(p: &PsfParameters, over: usize) -> Result<Vec<usize>, PsfError> {
     let side = 2 * max + 1;
     let pixels = p.pixels[0] * p.pixels[1];
     let planes: Vec<usize> = (0..p.planes_um.len()).collect();
-    let held = each(&planes, |&z| -> Result<Vec<f64>, PsfError> {
-        let light = points.light(&window, z, [0, 0])?;
+    let held = each(&planes, |buffers, &z| -> Result<Vec<f64>, PsfError> {
+        let light = points.light(&window, z, [0, 0], buffers)?;
         let mut shares = vec![0.0; max + 1];
         for (d, part) in light.chunks_exact(pixels).enumerate() {
             let far = (d / side).abs_diff(max).max((d % side).abs_diff(max));

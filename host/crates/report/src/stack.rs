@@ -62,7 +62,7 @@ impl ImageStack {
         let data = serde_json::json!({ "planes": pictures, "labels": self.labels });
         let data = data.to_string().replace('<', "\\u003c");
         Ok(Markup(format!(
-            "<div class=\"stack\"><p>{}: <span class=\"plane\">{}</span></p>\n<img alt=\"{}\" src=\"{}\" style=\"image-rendering:pixelated;width:min(100%,{}px)\"><br>\n<input type=\"range\" min=\"0\" max=\"{}\" value=\"{middle}\" aria-label=\"plane\" style=\"width:min(100%,512px)\">\n<script type=\"application/json\">{data}</script>\n<script>{SCRIPT}</script></div>",
+            "<div class=\"stack\"><p>{}: <span class=\"plane\">{}</span></p>\n<img alt=\"{}\" src=\"{}\" style=\"image-rendering:pixelated;width:min(100%,{}px)\"><br>\n<input type=\"range\" min=\"0\" max=\"{}\" value=\"{middle}\" aria-label=\"plane\" style=\"width:min(100%,512px);margin:0;box-sizing:border-box\">\n<script type=\"application/json\">{data}</script>\n<script>{SCRIPT}</script></div>",
             escape(&self.title),
             escape(&self.labels[middle]),
             escape(&self.title),

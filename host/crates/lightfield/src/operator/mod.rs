@@ -319,7 +319,7 @@ impl Operator {
             }
             best = Some(MemoryEstimate { tile: Some(cells), ..estimate });
         }
-        best.ok_or(OperatorError::Memory { needed_mib: smallest >> 20, limit_mib: limit >> 20 })
+        best.ok_or(OperatorError::Memory { needed_mib: smallest.div_ceil(1 << 20), limit_mib: limit >> 20 })
     }
 
     /// Builds the operator.
