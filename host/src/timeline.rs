@@ -241,6 +241,18 @@ pub fn played(events: &[daic_protocol::message::Event], begin: u64) -> Vec<(u64,
     crate::expand::changes(&words.collect::<Vec<_>>())
 }
 
+/// How the waits of a run ended, in order; ticks counted from `begin`.
+pub fn answers(events: &[daic_protocol::message::Event], begin: u64) -> Vec<crate::expand::Answer> {
+    use crate::expand::Answer;
+    use daic_protocol::message::EventKind;
+    let answer = |event: &daic_protocol::message::Event| match event.kind {
+        EventKind::Triggered { .. } => Some(Answer::Triggered(event.tick.saturating_sub(begin))),
+        EventKind::TimedOut { .. } => Some(Answer::TimedOut),
+        _ => None,
+    };
+    events.iter().filter_map(answer).collect()
+}
+
 /// The same lines of a plan.
 pub fn without_axes(words: &Words) -> Vec<(u64, u32)> {
     let words: Vec<_> = words.iter().map(|&(tick, word)| (tick, word & !channels::AXIS_MASK)).collect();

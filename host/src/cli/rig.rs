@@ -4,8 +4,9 @@ use super::commands::as_json;
 use super::output::{Answer, Output};
 use clap::{Args, Subcommand};
 use daic::box_program::{encode, read, read_instructions};
+use daic::expand::{self, Waits};
 use daic::recording::event_record;
-use daic::{Error, Progress as _, expand, timeline};
+use daic::{Error, Progress as _, timeline};
 use daic_dataset::atomic;
 use daic_protocol::limits::TICK_HZ;
 use daic_protocol::message::{Autostart, Event, EventKind, SelfTests, State};
@@ -109,8 +110,8 @@ pub fn run(arguments: &RigArgs, output: &Output) -> Result<Answer, Error> {
     if let RigCommand::Timeline { program, out, play: false } = &arguments.command
         && program.extension().is_none_or(|e| e != "toml")
     {
-        let planned = expand::expand(&read_instructions(program)?, [0; 6])?;
-        return draw(out, &planned, None);
+        let instructions = read_instructions(program)?;
+        return draw_plan(out, &instructions, [0; 6]);
     }
     let options = LinkOptions { baud: arguments.baud, ..LinkOptions::default() };
     let mut link = rig(Link::open(&arguments.port, options))?;
@@ -168,15 +169,16 @@ pub fn run(arguments: &RigArgs, output: &Output) -> Result<Answer, Error> {
         RigCommand::Timeline { program, out, play } => {
             let instructions = read(program, &mut link)?;
             let position = rig(link.status())?.position;
-            let planned = expand::expand(&instructions, position)?;
             if !play {
-                return draw(out, &planned, None);
+                return draw_plan(out, &instructions, position);
             }
             rig(link.load(&encode(&instructions)?))?;
             let events = play_loaded(&mut link, output)?;
             let begin =
                 events.iter().find(|e| matches!(e.kind, EventKind::RunStarted { .. })).map_or(0, |e| e.tick);
             let played = timeline::played(&events, begin);
+            let waits = timeline::answers(&events, begin);
+            let planned = expand::expand_with(&instructions, position, Waits::Ended(&waits))?;
             draw(out, &timeline::without_axes(&planned), Some(&played))
         }
     }
@@ -358,6 +360,15 @@ fn self_test(link: &mut Link) -> Result<Answer, Error> {
         writeln!(text, "board test {}: {verdict}", bit - 16).ok();
     }
     Ok(Answer::new(as_json(&found)?, text).checked(found.failed == 0))
+}
+
+/// Draws a program that has not been played: what it waits for comes at once.
+fn draw_plan(out: &std::path::Path, program: &[Instruction], position: [i32; 6]) -> Result<Answer, Error> {
+    let planned = expand::expand_with(program, position, Waits::AtOnce)?;
+    let answer = draw(out, &planned, None)?;
+    let waits = program.iter().any(|i| matches!(i, Instruction::Wait { .. }));
+    let note = ", drawn as if every trigger came as soon as something waits for it";
+    Ok(if waits { answer.with_note(note) } else { answer })
 }
 
 fn draw(
