@@ -55,6 +55,7 @@ pub mod sequence;
 pub mod settings;
 #[cfg(feature = "sim")]
 pub mod simulated;
+pub mod stage;
 pub mod strain;
 pub mod timeline;
 pub mod usage;

@@ -140,7 +140,8 @@ mod tests {
         // 4 t of speeding up and slowing down for 2 j t³ steps, the others at 40 000 steps/s
         let length = 4.0 * t + (f64::from(n) - 8000.0) / 40_000.0;
         let excess = end as f64 / f - length;
-        assert!((0.0..=3.0 * slice).contains(&excess), "{excess} s longer, slices of {slice} s");
+        // the three boxes are rounded up by less than a slice each, their convolution is two shorter than they
+        assert!((-2.0 * slice..=slice).contains(&excess), "{excess} s longer, slices of {slice} s");
         for (steps, seconds) in [(4000u32, 2.0 * t), (20_000, length / 2.0), (36_000, length - 2.0 * t)] {
             let found = ticks[steps as usize - 1] as f64 / f;
             assert!((found - seconds).abs() <= 3.0 * slice, "{steps}: {found} s, wanted {seconds} s");
