@@ -17,7 +17,6 @@ surface = { kind = \"sphere\", radius_mm = 40.0, apex_mm = 1.0 }
 steps_per_mm = [6430.0, 6400.0, 6350.0]
 backlash_mm = [0.012, 0.0, 0.025]
 [camera]
-bits = 8
 exposure_ns = 5000000
 trigger_delay_ns = 0
 [light]
@@ -27,10 +26,7 @@ led_electrons_per_s = [4.0e7]
     daic(folder.path(), ["init", "experiment.toml"]).expect_code(0);
     // fewer points: the mean over the field is what counts
     let path = folder.path().join("experiment.toml");
-    let text = std::fs::read_to_string(&path)
-        .expect("read")
-        .replace("step = 10 ", "step = 60 ")
-        .replace("bits = 12", "bits = 8");
+    let text = std::fs::read_to_string(&path).expect("read").replace("step = 10 ", "step = 60 ");
     std::fs::write(&path, text).expect("written");
 }
 
