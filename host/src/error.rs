@@ -592,6 +592,16 @@ pub enum Error {
         /// Frames wanted.
         least: usize,
     },
+    /// The box saw nothing of the camera.
+    #[error(
+        "no exposure was seen after {triggers} triggers of camera line {line}: is the camera's exposure-active output wired to the box, and does the camera wait for triggers?"
+    )]
+    NoExposures {
+        /// Camera line.
+        line: u8,
+        /// Triggers given.
+        triggers: u32,
+    },
     /// No folder of frames.
     #[error(
         "where do frames come from? Give --frames FOLDER, or `source = {{ folder = \"…\" }}` in [rig.camera]; `daic simulate` is for the simulated rig"

@@ -33,6 +33,7 @@ pub mod distortion_file;
 pub mod doctor;
 pub mod error;
 pub mod expand;
+pub mod exposure;
 mod figures;
 pub mod folder_camera;
 pub mod frames;

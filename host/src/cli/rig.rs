@@ -5,6 +5,7 @@ use super::output::{Answer, Output};
 use clap::{Args, Subcommand, ValueEnum};
 use daic::box_program::{encode, read, read_instructions};
 use daic::expand::{self, Waits};
+use daic::exposure::{self, Exposures, Stated};
 use daic::recording::event_record;
 use daic::{Error, Progress as _, stage, timeline};
 use daic_dataset::{Existing, atomic};
@@ -44,6 +45,8 @@ pub enum RigCommand {
     Box(BoxCommand),
     /// Find steps per millimetre, direction and backlash of an axis from what the camera sees
     CalibrateStage(StageArgs),
+    /// Measure delay and length of exposures on the camera's exposure-active line
+    CalibrateExposure(ExposureArgs),
 }
 
 /// What needs nothing but the box.
@@ -158,6 +161,54 @@ pub struct StageArgs {
     pub scene: Option<PathBuf>,
 }
 
+#[derive(Debug, Args)]
+pub struct ExposureArgs {
+    /// Experiment that describes the camera; its sequence is not played
+    pub experiment: PathBuf,
+    /// Exposures to measure
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub triggers: u32,
+}
+
+fn calibrate_exposure(
+    arguments: &ExposureArgs,
+    port: Option<&String>,
+    output: &Output,
+) -> Result<Answer, Error> {
+    let experiment = Experiment::load(&arguments.experiment)?;
+    let port = port.unwrap_or(&experiment.rig.port);
+    let mut link = rig(Link::open(port, daic::recording::link_options(&experiment)))?;
+    let stated = Stated::of(&experiment, link.hello().tick_hz);
+    let program = exposure::program(&experiment, link.hello(), arguments.triggers).map_err(RigError::from)?;
+    rig(link.load(&encode(&program)?))?;
+    let events: Vec<_> = play_loaded(&mut link, output)?.iter().map(event_record).collect();
+    let found = Exposures::of(&events, stated.line).summary(&stated);
+    let found = found.ok_or(Error::NoExposures { line: stated.line, triggers: arguments.triggers })?;
+    let mut text = format!(
+        "{} exposures after {} triggers, {} missing, {} unasked\n",
+        found.exposures, arguments.triggers, found.missing, found.unasked
+    );
+    let times = [
+        ("delay", found.delay_us, found.stated_delay_us),
+        ("length", found.length_us, found.stated_length_us),
+    ];
+    for (name, times, stated) in times {
+        let Some(t) = times else { continue };
+        writeln!(
+            text,
+            "{name:<7} {:.3} µs, jitter {:.3} µs ({:.3} to {:.3}), the experiment says {stated:.3} µs",
+            t.mean, t.std, t.min, t.max
+        )
+        .ok();
+    }
+    if let Some(delay) = found.delay_us {
+        write!(text, "in the experiment, under [rig.camera]:\nexposure_delay = \"{:.3} us\"", delay.mean)
+            .ok();
+    }
+    let whole = found.missing == 0 && found.unasked == 0 && found.exposures == arguments.triggers as usize;
+    Ok(Answer::new(as_json(&found)?, text).checked(whole))
+}
+
 fn calibrate_stage(arguments: &StageArgs, port: Option<&String>, output: &Output) -> Result<Answer, Error> {
     let experiment = Experiment::load(&arguments.experiment)?;
     output.stop_on_interrupt();
@@ -209,6 +260,9 @@ fn rig<T>(result: Result<T, daic_rig::link::LinkError>) -> Result<T, Error> {
 pub fn run(arguments: &RigArgs, output: &Output) -> Result<Answer, Error> {
     match &arguments.command {
         RigCommand::CalibrateStage(stage) => calibrate_stage(stage, arguments.port.as_ref(), output),
+        RigCommand::CalibrateExposure(exposure) => {
+            calibrate_exposure(exposure, arguments.port.as_ref(), output)
+        }
         RigCommand::Box(BoxCommand::Timeline { program, out, play: false })
             if program.extension().is_none_or(|e| e != "toml") =>
         {
