@@ -244,3 +244,26 @@ fn trigger_to_exposure_is_measured_and_corrected() {
         assert!(frame.note.contains("340.000 to 5340.000 µs"), "{}", frame.note);
     }
 }
+
+#[test]
+fn loops_are_streamed_as_if_they_were_stored() {
+    let folder = TempDir::new().expect("folder");
+    let program = r#"[
+        {"LoopBegin": {"count": 2000}},
+        {"Edge": {"mask": 4096, "value": 4096, "after": 30000}},
+        {"LoopBegin": {"count": 2}},
+        {"Edge": {"mask": 8192, "value": 8192, "after": 10000}},
+        {"Edge": {"mask": 8192, "value": 0, "after": 1000}},
+        "LoopEnd",
+        {"Edge": {"mask": 4096, "value": 0, "after": 500}},
+        "LoopEnd"
+    ]"#;
+    std::fs::write(folder.path().join("program.json"), program).expect("written");
+    let sim = Box::start(folder.path(), &["--pty"]);
+    let stream = ["rig", "stream", "program.json", "--json", "--port", &sim.port];
+    let answer = daic(folder.path(), stream).expect_code(0).json();
+    assert_eq!(answer["instructions"], 12_000);
+    // begin, 12 000 edges, the smallest lead, end
+    assert_eq!(answer["events"], 12_003, "{answer}");
+    assert!(answer["min_lead_ms"].as_f64().is_some_and(|lead| lead > 0.0), "{answer}");
+}

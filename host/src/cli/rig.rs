@@ -14,7 +14,7 @@ use daic_protocol::message::{Autostart, Event, EventKind, SelfTests, State};
 use daic_protocol::program::Instruction;
 use daic_rig::RigError;
 use daic_rig::experiment::Experiment;
-use daic_rig::link::{EventReader, Link, LinkOptions, StreamSender};
+use daic_rig::link::{EventReader, Link, LinkOptions, StreamSender, Unrolled};
 use daic_rig::units::Length;
 use serde_json::{Value, json};
 use std::fmt::Write as _;
@@ -453,14 +453,15 @@ fn follow(
 
 fn stream(link: &mut Link, path: &std::path::Path, output: &Output) -> Result<Answer, Error> {
     let instructions = read(path, link)?;
-    let count = instructions.len();
+    // the box takes no loops in streams
+    let count = Unrolled::count(&instructions);
     let status = rig(link.status())?;
     if status.state == State::Faulted {
         rig(link.clear_fault())?;
     }
     output.stop_on_interrupt();
-    output.stage("streaming", count as u64);
-    let mut sender = rig(StreamSender::begin(link, instructions.into_iter()))?;
+    output.stage("streaming", count);
+    let mut sender = rig(StreamSender::begin(link, Unrolled::new(&instructions)))?;
     rig(link.start())?;
     let mut last = sender.state();
     let events = follow(link, status.next_event, output, &mut |link| {

@@ -9,12 +9,14 @@ mod error;
 mod events;
 mod stream;
 mod transport;
+mod unroll;
 
 pub(crate) use error::state_name;
 pub use error::{LinkError, Outcome};
 pub use events::EventReader;
 pub use stream::StreamSender;
 pub use transport::{MAX_WRITE, PipeEnd, StreamTransport, Transport, available_ports, open, pipe};
+pub use unroll::Unrolled;
 
 use crate::clock::ClockSample;
 use daic_protocol::frame::{self, Decoder, Fed};
