@@ -40,6 +40,8 @@ pub mod folder_camera;
 pub mod frames;
 pub mod images;
 pub mod lightfield;
+#[cfg(feature = "sim")]
+pub mod lightfield_demo;
 pub mod measure;
 pub mod microscope;
 pub mod noise_floor;

@@ -1,6 +1,7 @@
 //! `daic lightfield` from image files to volumes.
 
 use daic::lightfield::psf_file;
+use daic_dataset::read_stack;
 use daic_lightfield::{Operator, OperatorSettings, Psf};
 use image::{ImageBuffer, Luma};
 use serde_json::Value;
@@ -116,22 +117,6 @@ fn highest(volume: &[f32], shape: [usize; 3]) -> [usize; 3] {
     [top / (shape[1] * shape[2]), top / shape[2] % shape[1], top % shape[2]]
 }
 
-/// Voxels of a TIFF stack.
-fn stack(path: &Path) -> Vec<f32> {
-    let mut decoder = tiff::decoder::Decoder::new(fs::File::open(path).expect("opens")).expect("TIFF");
-    let mut all = Vec::new();
-    loop {
-        let tiff::decoder::DecodingResult::F32(plane) = decoder.read_image().expect("plane") else {
-            panic!("no floats")
-        };
-        all.extend(plane);
-        if !decoder.more_images() {
-            return all;
-        }
-        decoder.next_image().expect("next");
-    }
-}
-
 #[test]
 fn from_white_image_to_volume() {
     let dir = tempfile::tempdir().expect("folder");
@@ -197,7 +182,8 @@ fn from_white_image_to_volume() {
     ]);
     assert_eq!(summary["psf_reused"], true);
     let shape = [PLANES, 11 * S, 11 * S];
-    assert_eq!(highest(&stack(&path("a/ideal.tif")), shape), at);
+    let (values, found) = read_stack(&path("a/ideal.tif")).expect("stack");
+    assert_eq!((found, highest(&values, shape)), (shape, at));
     assert!(path("a/ideal.ome.tif").is_file() && path("a/ideal.ome.zarr/zarr.json").is_file());
     assert!(path("a/ideal-xz.png").is_file());
     assert!(fs::read_to_string(path("a/ideal.html")).expect("page").contains("z = 5.00 µm"));
@@ -237,8 +223,9 @@ fn from_white_image_to_volume() {
         "f16",
         "--momentum",
     ]);
-    let [_, height, width] = summary_shape(&path("b/seen.tif"));
-    let found = highest(&stack(&path("b/seen.tif")), [PLANES, height, width]);
+    let (values, shape) = read_stack(&path("b/seen.tif")).expect("stack");
+    let [_, height, width] = shape;
+    let found = highest(&values, shape);
     // the same bead among the whole cells of the camera, which are counted from another corner
     let from_middle = |v: usize, cells: usize| v as f64 - 0.5 * (cells * S) as f64;
     let corner = [SIZE[1], SIZE[0]].map(|n| (n as f64 / pitch).floor());
@@ -253,13 +240,6 @@ fn from_white_image_to_volume() {
     }
 }
 
-/// (planes, rows, columns) of a stack.
-fn summary_shape(path: &Path) -> [usize; 3] {
-    let mut decoder = tiff::decoder::Decoder::new(fs::File::open(path).expect("opens")).expect("TIFF");
-    let (width, height) = decoder.dimensions().expect("size");
-    [PLANES, height as usize, width as usize]
-}
-
 #[test]
 fn bad_input_is_named_and_leaves_nothing() {
     let dir = tempfile::tempdir().expect("folder");
@@ -271,7 +251,8 @@ fn bad_input_is_named_and_leaves_nothing() {
     let lattice = path("lattice.toml");
     json(&["lightfield", "calibrate", text(&path("white.png")), "--out", text(&lattice)]);
     let frame = path("frame.png");
-    save(&frame, 11 * N, &vec![100.0; 121 * N * N], 1.0);
+    let even: Vec<f32> = (0..121 * N * N).map(|i| 100.0 + (i % 7) as f32).collect();
+    save(&frame, 11 * N, &even, 1.0);
     let out = path("out");
     let reconstruct = |setup: &Path, frame: &Path, more: &[&str]| {
         let basic = ["lightfield", "reconstruct", text(setup), text(frame), "--out", text(&out)];

@@ -110,8 +110,10 @@ impl LightFieldScene {
             .map(|b| {
                 let [x, y, z] = b.centre_um;
                 // the stage's z points towards the objective
-                let moved = [x + 1e3 * stage_mm[0], y + 1e3 * stage_mm[1], z - 1e3 * stage_mm[2]];
-                (moved, 0.5 * b.diameter_um)
+                let [x, y, z] = [x + 1e3 * stage_mm[0], y + 1e3 * stage_mm[1], z - 1e3 * stage_mm[2]];
+                // voxels lie along the lenslets, beads and stage along the sensor
+                let (sin, cos) = self.config.rotation_rad.sin_cos();
+                ([x * cos + y * sin, y * cos - x * sin, z], 0.5 * b.diameter_um)
             })
             .collect();
         let mut out = vec![0f32; self.planes_um.len() * ny * nx];

@@ -8,5 +8,6 @@ pub mod output;
 pub mod psf_file;
 pub mod series;
 pub mod setup;
+pub mod spots;
 
 pub use error::LightFieldError;

@@ -27,4 +27,4 @@ pub use lattice::Lattice;
 pub use map::{FloatMap, MapAxes, MapError};
 pub use npz::NpzError;
 pub use table::{Column, Table, TableError};
-pub use volume::{Volume, VolumeError};
+pub use volume::{Volume, VolumeError, read_stack};

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 use thiserror::Error;
 use tiff::TiffError;
+use tiff::decoder::{Decoder, DecodingResult};
 use tiff::encoder::{TiffEncoder, TiffKind, colortype};
 use tiff::tags::Tag;
 
@@ -40,6 +41,14 @@ pub enum VolumeError {
         shape: [usize; 3],
         /// Values handed over.
         values: usize,
+    },
+    /// The file is no stack.
+    #[error("cannot read {}: {reason}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        reason: String,
     },
     /// The encoder refused.
     #[error("cannot encode {}: {reason}", path.display())]
@@ -191,10 +200,35 @@ impl Volume<'_> {
     }
 }
 
+/// Reads a stack of planes of 32-bit floating point numbers: values and (planes, rows, columns).
+///
+/// # Errors
+/// [`VolumeError::Read`] for a file that cannot be read or is no such stack.
+pub fn read_stack(path: &Path) -> Result<(Vec<f32>, [usize; 3]), VolumeError> {
+    let failed = |reason: String| VolumeError::Read { path: path.to_path_buf(), reason };
+    let bytes = fs::read(path).map_err(|e| failed(e.to_string()))?;
+    let mut decoder = Decoder::new(Cursor::new(bytes)).map_err(|e| failed(e.to_string()))?;
+    let size = decoder.dimensions().map_err(|e| failed(e.to_string()))?;
+    let (mut values, mut planes) = (Vec::new(), 0);
+    loop {
+        if decoder.dimensions().map_err(|e| failed(e.to_string()))? != size {
+            return Err(failed(format!("plane {planes} has another size than the first")));
+        }
+        match decoder.read_image().map_err(|e| failed(e.to_string()))? {
+            DecodingResult::F32(plane) => values.extend(plane),
+            _ => return Err(failed(format!("plane {planes} does not hold 32-bit floating point numbers"))),
+        }
+        planes += 1;
+        if !decoder.more_images() {
+            return Ok((values, [planes, size.1 as usize, size.0 as usize]));
+        }
+        decoder.next_image().map_err(|e| failed(e.to_string()))?;
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use tiff::decoder::{Decoder, DecodingResult};
 
     #[test]
     fn stacks_read_back() {
@@ -210,15 +244,8 @@ mod tests {
             }
             let mut decoder = Decoder::new(Cursor::new(fs::read(&path).unwrap())).unwrap();
             assert!(decoder.get_tag_ascii_string(Tag::ImageDescription).unwrap().contains(word));
-            let mut all = Vec::new();
-            loop {
-                let DecodingResult::F32(plane) = decoder.read_image().unwrap() else { panic!("no floats") };
-                all.extend(plane);
-                if !decoder.more_images() {
-                    break;
-                }
-                decoder.next_image().unwrap();
-            }
+            let (all, shape) = read_stack(&path).unwrap();
+            assert_eq!(shape, volume.shape);
             assert_eq!(all, values);
         }
         let zarr = dir.path().join("a.ome.zarr");
@@ -233,5 +260,7 @@ mod tests {
         let short = Volume { values: &values[1..], ..volume };
         assert!(matches!(short.write_tiff(&dir.path().join("b.tif")), Err(VolumeError::Shape { .. })));
         assert!(!dir.path().join("b.tif").exists());
+        fs::write(dir.path().join("c.tif"), b"II*").unwrap();
+        assert!(matches!(read_stack(&dir.path().join("c.tif")), Err(VolumeError::Read { .. })));
     }
 }
