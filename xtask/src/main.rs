@@ -21,7 +21,8 @@ cargo xtask COMMAND
   reproduce  macro: chapter 2 of the thesis, micro: chapter 3, simulated and measured, into
              docs/reproduction.md
   hil        --faults N: N more runs of the fault campaign; totals in docs/campaigns/faults.json
-             --verifier [--long]: 10 000 (1 000 000) random programs through the verifier
+             --verifier [--long]: 10 000 (1 000 000 more) random programs through the verifier
+  fuzz       [--long]: each fuzz target for a minute (an hour); needs a nightly compiler and cargo-fuzz
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders
              guard [--update]: instruction counts against the baseline (or: makes a new one)
@@ -44,8 +45,10 @@ fn main() -> ExitCode {
         ["hil", "--faults", count] if count.parse::<u64>().is_ok() => {
             campaign::faults(count.parse().unwrap_or(0))
         }
-        ["hil", "--verifier"] => campaign::verifier(10_000),
-        ["hil", "--verifier", "--long"] => campaign::verifier(1_000_000),
+        ["hil", "--verifier"] => campaign::verifier(),
+        ["hil", "--verifier", "--long"] => campaign::verifier_long(100),
+        ["fuzz"] => campaign::fuzz(60),
+        ["fuzz", "--long"] => campaign::fuzz(3600),
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),
         ["bench", "optics"] => steps::bench_optics(),
