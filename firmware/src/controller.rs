@@ -31,6 +31,9 @@ pub struct Controller {
     /// `Some` while running; the flag tells whether `RunStarted` has been reported.
     player: Option<(Player, bool)>,
     now: u64,
+    /// Words up to this tick are out of hand.
+    horizon: u64,
+    health: Health,
 }
 
 impl Controller {
@@ -48,6 +51,8 @@ impl Controller {
             run: 0,
             player: None,
             now: 0,
+            horizon: 0,
+            health: Health::default(),
         }
     }
 
@@ -159,6 +164,39 @@ impl Controller {
         self.player.as_ref().map(|(player, _)| player.due())
     }
 
+    /// A player in hardware has been given everything before `tick`: `Stop` ends the run with the
+    /// instruction that is current then.
+    pub fn committed(&mut self, tick: u64) {
+        self.horizon = tick;
+    }
+
+    /// The outputs have gone safe at `tick` without being told to; a run that is under way ends.
+    pub fn trip(&mut self, cause: FaultCause, tick: u64, sink: &mut dyn Sink) {
+        if self.state == State::Running {
+            self.play(tick.saturating_sub(1), sink);
+        }
+        if self.state == State::Running {
+            self.fail(cause, tick, sink);
+        }
+    }
+
+    /// What the board tells about itself in `Health`.
+    pub fn set_health(&mut self, health: Health) {
+        self.health = health;
+    }
+
+    pub(crate) fn cursor(&self) -> Option<(&Player, &Outputs)> {
+        self.player.as_ref().map(|(player, _)| (player, &self.out))
+    }
+
+    pub(crate) fn program_bytes(&self) -> &[u8] {
+        self.loader.program()
+    }
+
+    pub(crate) fn stop_from(&self) -> Option<u64> {
+        self.player.as_ref().and_then(|(player, _)| player.stop_from())
+    }
+
     fn end(&mut self, tick: u64, sink: &mut dyn Sink) {
         self.out.make_safe(tick, sink);
         let (words, events) = (self.out.words, self.out.events.wrapping_add(1));
@@ -219,6 +257,7 @@ impl Controller {
             Request::Hello => return encode_reply(id, &Reply::Hello(self.hello())),
             Request::Status => return encode_reply(id, &Reply::Status(self.status())),
             Request::Clock => return encode_reply(id, &Reply::Clock { tick: now }),
+            Request::Health => return encode_reply(id, &Reply::Health(self.health)),
             Request::ReadEvents { from } => return self.events(id, *from),
             Request::LoadBegin { length } => self.loader.begin(*length),
             Request::LoadChunk { index, data } => self.loader.chunk(*index, data),
@@ -342,7 +381,7 @@ impl Controller {
 
     fn stop(&mut self) -> Result<(), Refusal> {
         match (self.state, &mut self.player) {
-            (State::Running, Some((player, _))) => player.stop(),
+            (State::Running, Some((player, _))) => player.stop(self.now.max(self.horizon)),
             (State::Armed, _) => self.state = State::Loaded,
             _ => return self.wrong_state(),
         }
@@ -353,7 +392,13 @@ impl Controller {
         match self.state {
             State::Running => {
                 let tick = self.out.earliest_safe(self.now.max(self.out.last()));
-                self.fail(FaultCause::Aborted, tick, sink);
+                let halted = sink.halt(tick);
+                if halted > tick {
+                    // What came out until then has happened.
+                    self.trip(FaultCause::Aborted, halted, sink);
+                } else {
+                    self.fail(FaultCause::Aborted, tick, sink);
+                }
             }
             State::Armed => self.state = State::Loaded,
             State::Empty | State::Loaded | State::Faulted => {}

@@ -20,16 +20,22 @@
     )
 )]
 
+mod ahead;
+pub mod blocks;
 pub mod board;
 mod controller;
 mod events;
+pub mod links;
 mod loader;
 pub mod motion;
 mod outputs;
+pub mod pico;
 mod replies;
+pub mod slots;
 mod timeline;
 pub mod verifier;
 
+pub use ahead::{Ahead, Reached};
 pub use board::{AxisLimits, Board, LedLimits};
 pub use controller::{Controller, START_LEAD};
 pub use replies::READ_CACHE;
@@ -40,4 +46,9 @@ pub trait Sink {
     fn word(&mut self, tick: u64, word: u32);
     /// At about `tick` LED `led` gets `level` (PWM or DAC, not tick-exact).
     fn level(&mut self, tick: u64, led: u8, level: u16);
+    /// All outputs must go safe at once, without waiting for `tick`; returns the tick at which they
+    /// did. What plays on time by itself goes safe at `tick`.
+    fn halt(&mut self, tick: u64) -> u64 {
+        tick
+    }
 }

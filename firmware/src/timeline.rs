@@ -68,7 +68,7 @@ enum Line {
 }
 
 /// Where a program has got to.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct Player {
     /// End of the last instruction.
     now: u64,
@@ -79,8 +79,8 @@ pub(crate) struct Player {
     next: u16,
     loops: heapless::Vec<Loop, MAX_LOOP_DEPTH>,
     current: Current,
-    /// End after the current instruction.
-    stopping: bool,
+    /// End after the instruction that is current at this tick.
+    stopping: Option<u64>,
 }
 
 impl Player {
@@ -93,7 +93,7 @@ impl Player {
             next: 0,
             loops: heapless::Vec::new(),
             current: Current::None,
-            stopping: false,
+            stopping: None,
         }
     }
 
@@ -101,8 +101,13 @@ impl Player {
         self.index
     }
 
-    pub(crate) fn stop(&mut self) {
-        self.stopping = true;
+    /// Ends after the instruction that is current at tick `from`.
+    pub(crate) fn stop(&mut self, from: u64) {
+        self.stopping.get_or_insert(from);
+    }
+
+    pub(crate) fn stop_from(&self) -> Option<u64> {
+        self.stopping
     }
 
     /// Tick of the next thing to be done.
@@ -131,7 +136,7 @@ impl Player {
             }
             match self.current {
                 Current::None => {
-                    if self.stopping {
+                    if self.stopping.is_some_and(|from| tick >= from) {
                         self.current = Current::End(out.earliest_safe(tick));
                     } else if self.read(tick, program, out, sink).is_none() {
                         return Progress::Broken;

@@ -36,6 +36,40 @@ pub fn crc32(bytes: &[u8]) -> u32 {
     CRC.checksum(bytes)
 }
 
+/// [`crc32`] of bytes that come in parts.
+pub struct Digest(crc::Digest<'static, u32>);
+
+static TABLE: crc::Crc<u32> = CRC;
+
+impl Default for Digest {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl core::fmt::Debug for Digest {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.write_str("Digest")
+    }
+}
+
+impl Digest {
+    /// Of no bytes yet.
+    pub fn new() -> Self {
+        Self(TABLE.digest())
+    }
+
+    /// More bytes.
+    pub fn update(&mut self, bytes: &[u8]) {
+        self.0.update(bytes);
+    }
+
+    /// Of all of them.
+    pub fn finish(self) -> u32 {
+        self.0.finalize()
+    }
+}
+
 /// What a frame holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]

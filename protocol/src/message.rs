@@ -61,6 +61,8 @@ pub enum Request {
     },
     /// One clock sample; the reply carries the tick at which the request was received.
     Clock,
+    /// How the board itself is doing.
+    Health,
 }
 
 /// From box to host. The frame header carries the id of the request answered.
@@ -85,6 +87,41 @@ pub enum Reply {
         /// Tick at which the request's last byte was received.
         tick: u64,
     },
+    /// Answer to `Health`.
+    Health(Health),
+}
+
+/// How the board itself is doing; all zero from a board that does not measure itself.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Health {
+    /// Why the board last started.
+    pub reset: ResetCause,
+    /// Bytes of memory between variables and the top of the stack.
+    pub stack_size: u32,
+    /// Most bytes of stack ever in use since the start.
+    pub stack_peak: u32,
+    /// Bytes received while there was no room for them.
+    pub received_lost: u32,
+    /// Replies dropped because nobody took the ones before.
+    pub replies_lost: u32,
+    /// Least ticks by which words were ready before their time in the last run.
+    pub lead: u32,
+    /// Longest turn of the main loop since the start, in ticks.
+    pub turn: u32,
+}
+
+/// Why a board last started. Append-only.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum ResetCause {
+    /// Not known, or power was switched on.
+    #[default]
+    Power,
+    /// The watchdog: the program hung.
+    Watchdog,
+    /// The program found an impossible state, made the outputs safe and started anew.
+    Panic,
+    /// The processor refused an instruction or an access.
+    HardFault,
 }
 
 /// What the box is and can do. **Frozen for ever**: a host of any version can read it.
@@ -340,6 +377,10 @@ pub enum FaultCause {
     Underrun,
     /// A committed program broke a rule at run time.
     Internal,
+    /// The interlock input does not permit outputs.
+    Interlock,
+    /// The processor did not report in time.
+    Heartbeat,
 }
 
 /// Answer to `ReadEvents`.

@@ -63,6 +63,7 @@ fn requests() -> Vec<(Request, &'static str)> {
         (Request::ClearFault, "0a"),
         (Request::ReadEvents { from: 256 }, "0b 80 02"),
         (Request::Clock, "0c"),
+        (Request::Health, "0d"),
     ]
 }
 
@@ -125,6 +126,18 @@ fn replies() -> Vec<(Reply, &'static str)> {
         (Reply::Refused(Refusal::IdReused), "03 09"),
         (Reply::Events(events), "04 05 06 02 01 05 e8 07 03 03"),
         (Reply::Clock { tick: u64::MAX }, "05 ff ff ff ff ff ff ff ff ff 01"),
+        (
+            Reply::Health(Health {
+                reset: ResetCause::Watchdog,
+                stack_size: 200_000,
+                stack_peak: 9000,
+                received_lost: 1,
+                replies_lost: 2,
+                lead: 1_250_000,
+                turn: 128,
+            }),
+            "06 01 c0 9a 0c a8 46 01 02 d0 a5 4c 80 01",
+        ),
     ]
 }
 
@@ -178,7 +191,22 @@ fn rules() -> Vec<(Violation, &'static str)> {
 }
 
 fn causes() -> Vec<(FaultCause, &'static str)> {
-    vec![(FaultCause::Aborted, "00"), (FaultCause::Underrun, "01"), (FaultCause::Internal, "02")]
+    vec![
+        (FaultCause::Aborted, "00"),
+        (FaultCause::Underrun, "01"),
+        (FaultCause::Internal, "02"),
+        (FaultCause::Interlock, "03"),
+        (FaultCause::Heartbeat, "04"),
+    ]
+}
+
+fn resets() -> Vec<(ResetCause, &'static str)> {
+    vec![
+        (ResetCause::Power, "00"),
+        (ResetCause::Watchdog, "01"),
+        (ResetCause::Panic, "02"),
+        (ResetCause::HardFault, "03"),
+    ]
 }
 
 fn events() -> Vec<(Event, &'static str)> {
@@ -225,6 +253,7 @@ fn every_message_has_its_bytes() {
         check(&refusals(), &[]),
         check(&rules(), &[0]),
         check(&causes(), &[]),
+        check(&resets(), &[]),
         check(&events(), &[1, 2]),
         check(&instructions(), &[]),
     ];

@@ -1,5 +1,6 @@
 //! Tools of the whole-chain tests: the program as a user runs it, data of others, independent truths.
 
 pub mod expansion;
+pub mod hil;
 pub mod program;
 pub mod shared;

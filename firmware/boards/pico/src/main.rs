@@ -1,0 +1,182 @@
+//! The daic trigger box on a Raspberry Pi Pico.
+//!
+//! The controller of `daic-firmware` on real pins. One loop serves links, look-ahead and levels;
+//! all timing is in PIO and DMA ([`player`]), so how long a turn takes decides nothing but how far
+//! ahead the player is filled.
+#![no_std]
+#![no_main]
+
+mod clock;
+mod player;
+mod reg;
+mod reset;
+mod serial;
+mod stack;
+
+use daic_firmware::links::FrameGate;
+use daic_firmware::pico::INTERLOCK;
+use daic_firmware::{Board, Controller, Sink};
+use daic_protocol::message::{Health, State};
+use embedded_hal::pwm::SetDutyCycle;
+use hal::Clock;
+use hal::fugit::{ExtU32, RateExtU32};
+use hal::pac::{self, interrupt};
+use player::Player;
+use rp2040_hal as hal;
+use serial::{Link, Outgoing};
+use usb_device::bus::UsbBusAllocator;
+
+/// The second stage of the boot: sets up the flash chip.
+#[unsafe(link_section = ".boot2")]
+#[used]
+static BOOT2_FIRMWARE: [u8; 256] = rp2040_boot2::BOOT_LOADER_W25Q080;
+
+/// A turn of the main loop that takes longer than this resets the board.
+const WATCHDOG_MS: u32 = 500;
+
+/// What the controller reaches directly: levels at their time; words are the player's.
+struct Direct<'a> {
+    levels: [&'a mut dyn SetDutyCycle<Error = core::convert::Infallible>; 4],
+}
+
+impl Sink for Direct<'_> {
+    fn word(&mut self, _: u64, _: u32) {}
+    fn level(&mut self, _: u64, led: u8, level: u16) {
+        if let Some(channel) = self.levels.get_mut(usize::from(led)) {
+            let _ = channel.set_duty_cycle(level);
+        }
+    }
+    fn halt(&mut self, tick: u64) -> u64 {
+        player::halt().max(tick)
+    }
+}
+
+#[hal::entry]
+fn main() -> ! {
+    stack::paint();
+    let (cause, boots) = reset::cause();
+    // Every peripheral is taken here and nowhere else.
+    let (Some(mut p), Some(mut core)) = (pac::Peripherals::take(), pac::CorePeripherals::take()) else {
+        unreachable!()
+    };
+    let mut watchdog = hal::watchdog::Watchdog::new(p.WATCHDOG);
+    let Ok(clocks) = hal::clocks::init_clocks_and_plls(
+        12_000_000,
+        p.XOSC,
+        p.CLOCKS,
+        p.PLL_SYS,
+        p.PLL_USB,
+        &mut p.RESETS,
+        &mut watchdog,
+    ) else {
+        unreachable!()
+    };
+    watchdog.start(WATCHDOG_MS.millis());
+    let sio = hal::Sio::new(p.SIO);
+    let pins = hal::gpio::Pins::new(p.IO_BANK0, p.PADS_BANK0, sio.gpio_bank0, &mut p.RESETS);
+    p.RESETS.reset().modify(|_, w| w.dma().clear_bit().pio0().clear_bit().pio1().clear_bit());
+    while {
+        let done = p.RESETS.reset_done().read();
+        done.dma().bit_is_clear() || done.pio0().bit_is_clear() || done.pio1().bit_is_clear()
+    } {}
+    let mut player = Player::new();
+    clock::start(&mut core.SYST);
+
+    let slices = hal::pwm::Slices::new(p.PWM, &mut p.RESETS);
+    let (mut pwm0, mut pwm1) = (slices.pwm0, slices.pwm1);
+    // With this top every 16-bit level is a duty cycle, 65 535 fully on.
+    pwm0.set_top(0xfffe);
+    pwm1.set_top(0xfffe);
+    pwm0.channel_a.output_to(pins.gpio16);
+    pwm0.channel_b.output_to(pins.gpio17);
+    pwm1.channel_a.output_to(pins.gpio18);
+    pwm1.channel_b.output_to(pins.gpio19);
+    let mut direct = Direct {
+        levels: [&mut pwm0.channel_a, &mut pwm0.channel_b, &mut pwm1.channel_a, &mut pwm1.channel_b],
+    };
+    for channel in &mut direct.levels {
+        let _ = channel.set_duty_cycle(0);
+    }
+    pwm0.enable();
+    pwm1.enable();
+
+    let uart_pins = (
+        pins.gpio0.into_function::<hal::gpio::FunctionUart>(),
+        pins.gpio1.into_function::<hal::gpio::FunctionUart>(),
+    );
+    let config = hal::uart::UartConfig::new(
+        serial::BAUD.Hz(),
+        hal::uart::DataBits::Eight,
+        None,
+        hal::uart::StopBits::One,
+    );
+    let uart = hal::uart::UartPeripheral::new(p.UART0, uart_pins, &mut p.RESETS);
+    let Ok(mut uart) = uart.enable(config, clocks.peripheral_clock.freq()) else { unreachable!() };
+    uart.enable_rx_interrupt();
+    serial::start_uart();
+    let bus = hal::usb::UsbBus::new(p.USBCTRL_REGS, p.USBCTRL_DPRAM, clocks.usb_clock, true, &mut p.RESETS);
+    if let Some(allocator) = cortex_m::singleton!(: UsbBusAllocator<hal::usb::UsbBus> = UsbBusAllocator::new(bus)) {
+        serial::start_usb(allocator);
+    }
+    // The interlock: only its falling edge matters here, and only for the tick reported.
+    let shift = 4 * (u32::from(INTERLOCK) % 8);
+    let bank = 4 * (u32::from(INTERLOCK) / 8);
+    reg::write(reg::IO_BANK0 + 0xf0 + bank, 0xf << shift);
+    reg::write(reg::IO_BANK0 + 0x100 + bank + reg::SET, 4 << shift);
+    // SAFETY: the handler below shares nothing but atomics.
+    unsafe { pac::NVIC::unmask(pac::Interrupt::IO_IRQ_BANK0) };
+
+    let noise = (0..32).fold(0u32, |bits, _| (bits << 1) | u32::from(p.ROSC.randombit().read().bits() & 1 != 0));
+    // Another one at every boot: noise of the ring oscillator, and the count since power came.
+    let boot_id = noise.wrapping_add(boots.wrapping_mul(0x9e37_79b9));
+    let Some(controller) = cortex_m::singleton!(: Controller = Controller::new(Board::pico(), boot_id)) else {
+        unreachable!()
+    };
+    let mut links = [
+        (Link::Uart, FrameGate::new(), Outgoing::new(Link::Uart)),
+        (Link::Usb, FrameGate::new(), Outgoing::new(Link::Usb)),
+    ];
+    let mut watch = stack::Watch::new();
+    let mut health = Health { reset: cause, stack_size: stack::Watch::size(), ..Health::default() };
+    let mut last = clock::now();
+    loop {
+        let now = clock::now();
+        health.turn = health.turn.max(u32::try_from(now.wrapping_sub(last)).unwrap_or(u32::MAX));
+        last = now;
+        watchdog.feed();
+        player.feed(now);
+        controller.play(now, &mut direct);
+        player.service(controller, &mut direct);
+        watch.look();
+        let restarted = serial::restarted();
+        for (link, gate, outgoing) in &mut links {
+            if restarted && *link == Link::Usb {
+                gate.restart();
+            }
+            // One frame a turn, so that none delays the player by more than itself.
+            while let Some((byte, stamp)) = serial::receive(*link) {
+                let Some(frame) = gate.feed(byte) else { continue };
+                health.received_lost = serial::lost();
+                health.stack_peak = watch.peak;
+                health.lead = player.lead;
+                health.replies_lost = outgoing.lost;
+                controller.set_health(health);
+                let at = stamp.unwrap_or(now);
+                controller.receive(at, frame, &mut direct, &mut |reply| outgoing.send(reply));
+                if controller.state() == State::Running {
+                    player.service(controller, &mut direct);
+                }
+                break;
+            }
+            outgoing.pump();
+        }
+    }
+}
+
+#[interrupt]
+fn IO_IRQ_BANK0() {
+    player::opened();
+    let shift = 4 * (u32::from(INTERLOCK) % 8);
+    let bank = 4 * (u32::from(INTERLOCK) / 8);
+    reg::write(reg::IO_BANK0 + 0xf0 + bank, 4 << shift);
+}
