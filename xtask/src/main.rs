@@ -1,9 +1,11 @@
-//! The one entry for people and CI: `cargo xtask test | lint | figures | bench`.
+//! The one entry for people and CI: `cargo xtask test | lint | firmware | hil | figures | bench`.
 //!
 //! Every step runs even when an earlier one failed, and the end names what passed, what failed
 //! and what could not be run on this machine, with the reason.
 
 mod bench;
+mod firmware;
+mod hil;
 mod steps;
 
 use std::process::ExitCode;
@@ -12,7 +14,10 @@ const USAGE: &str = "\
 cargo xtask COMMAND
 
   test       everything that proves the project: unit, property and whole-chain tests, the
-             firmware for thumbv6m-none-eabi (brings its toolchain into target/), the examples
+             the Pico's image (brings its toolchain into target/) and the cases on it in an emulator
+  firmware   the Pico's image as ELF and UF2, in target/firmware/
+  hil        [--target inprocess|pty|pico] [--port PORT] [--long] [--filter TEXT]: the same cases on the
+             controller, on the simulated board, on the emulated Pico, on the board at PORT
   lint       formatting, clippy, documentation without warnings, cargo-deny where installed
   ci         test, then lint
   figures    draws the pictures of README and docs anew with the program itself
@@ -32,6 +37,12 @@ fn main() -> ExitCode {
             report.append(steps::lint());
             report
         }
+        ["firmware"] => {
+            let mut report = steps::Report::default();
+            report.step("firmware for the Pico", firmware::build);
+            report
+        }
+        ["hil", ..] => hil::hil(&words[1..]),
         ["figures"] => steps::figures(),
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),

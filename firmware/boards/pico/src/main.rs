@@ -91,15 +91,14 @@ fn main() -> ! {
     pwm0.channel_b.output_to(pins.gpio17);
     pwm1.channel_a.output_to(pins.gpio18);
     pwm1.channel_b.output_to(pins.gpio19);
+    pwm0.enable();
+    pwm1.enable();
     let mut direct = Direct {
         levels: [&mut pwm0.channel_a, &mut pwm0.channel_b, &mut pwm1.channel_a, &mut pwm1.channel_b],
     };
     for channel in &mut direct.levels {
         let _ = channel.set_duty_cycle(0);
     }
-    pwm0.enable();
-    pwm1.enable();
-
     let uart_pins = (
         pins.gpio0.into_function::<hal::gpio::FunctionUart>(),
         pins.gpio1.into_function::<hal::gpio::FunctionUart>(),

@@ -59,8 +59,8 @@ const SLOTS: usize = 256;
 pub const LOOK_AHEAD: u64 = 2_500_000;
 /// From the launch to the first tick of a program: 200 µs of the safe word.
 const LEAD_IN: u64 = 25_000;
-/// Time kept for the launch itself: 40 µs.
-const LAUNCH_MARGIN: u64 = 5_000;
+/// Time kept for the launch itself: 100 µs.
+const LAUNCH_MARGIN: u64 = 12_500;
 /// From the reading of the core's timer for which the launch is set to the first word on the pins.
 const LAUNCH_DELAY: u64 = 3;
 /// Turns of three ticks that the processor may be silent: 5 ms.
@@ -117,7 +117,8 @@ impl Ring {
         // before any older slot.
         unsafe {
             let to = MEMORY.blocks.get().cast::<[u32; 2 * BLOCK]>().add(buffer);
-            for (pair, record) in (*to).chunks_exact_mut(2).zip(&block.records) {
+            let words: &mut [u32; 2 * BLOCK] = &mut *to;
+            for (pair, record) in words.chunks_exact_mut(2).zip(&block.records) {
                 if let [word, ticks] = pair {
                     *word = record.word;
                     *ticks = record.ticks.wrapping_sub(4);
@@ -294,11 +295,8 @@ impl Player {
         }
         self.fill(controller, launch.saturating_sub(LAUNCH_MARGIN));
         write(DMA + 0x430, 2); // start channel 1
-        while read(PIO0 + 0xc) & 0xf < 8 {
-            if clock::now() > launch {
-                break;
-            }
-        }
+        // It fills the FIFO meanwhile.
+        while clock::now().saturating_add(LAUNCH_MARGIN) < launch {}
         if launch_at(launch) {
             self.ring.running = true;
             self.fed = launch;
@@ -321,7 +319,7 @@ impl Player {
         let mut steps = 0u32;
         while !run.complete && ring.free() >= 4 && run.packer.upto() < until {
             steps = steps.wrapping_add(1);
-            if steps % 8 == 0 && clock::now() > deadline {
+            if steps % 4 == 0 && clock::now() > deadline {
                 break;
             }
             // Often enough that links and events are served in between.
@@ -334,7 +332,7 @@ impl Player {
                 run.packer.quiet(quiet, &mut |block| ring.commit(block));
                 continue;
             }
-            let mut packing = Packing { packer: &mut run.packer, ring, broken: false };
+            let mut packing = Packing { packer: &mut run.packer, ring: &mut *ring, broken: false };
             let reached = run.ahead.play(due, controller, &mut packing);
             let broken = packing.broken;
             match reached {
@@ -427,7 +425,6 @@ fn launch_at(tick: u64) -> bool {
 #[inline(never)]
 #[unsafe(link_section = ".data.launch")]
 fn launch(reading: u32) {
-    let machines = 1 << PLAY | 1 << PULSE | 1 << GUARD;
     // SAFETY: reads one register and writes another; jumps within its own instructions.
     unsafe {
         core::arch::asm!(
@@ -437,24 +434,25 @@ fn launch(reading: u32) {
             "2: ldr {left}, [{cvr}]",
             "subs {left}, {left}, {reading}",
             "lsls {left}, {left}, #8",
-            "cmp {left}, {most}",
+            "lsrs {left}, {left}, #8",
+            "cmp {left}, #60",
             "bhi 2b",
             // What is left is waited for in as many no-operations, 2 bytes and a cycle each.
-            "lsrs {left}, {left}, #7",
+            "lsls {left}, {left}, #1",
             "subs {to}, {to}, {left}",
             "bx {to}",
             ".rept 64",
             "nop",
             ".endr",
             ".balign 4",
-            "3: str {machines}, [{ctrl}]",
+            "3: movs {left}, #{machines}",
+            "str {left}, [{ctrl}]",
             left = out(reg) _,
             to = out(reg) _,
             cvr = in(reg) reg::SYST_CVR,
             reading = in(reg) reading,
-            most = in(reg) 60u32 << 8,
-            machines = in(reg) machines,
             ctrl = in(reg) PIO0,
+            machines = const (1 << PLAY) | (1 << PULSE) | (1 << GUARD),
             options(nostack),
         );
     }
