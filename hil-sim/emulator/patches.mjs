@@ -1,5 +1,5 @@
 // What rp2040js 1.4.1 lacks for this image. Each patch has a test of its own in test.mjs.
-import { RPPIO, StateMachine, FIFO, RPUART, RPPPB } from './rp2040.mjs';
+import { RPPIO, StateMachine, FIFO, RPUART, RPPPB, RPDMA } from './rp2040.mjs';
 
 const machine = StateMachine.prototype, pio = RPPIO.prototype;
 
@@ -131,3 +131,8 @@ RPPPB.prototype.readUint32 = function (offset) {
   if (offset === 0x18) return (0xffffff - (this.rp2040.ticks() & 0xffffff)) >>> 0;
   return stockPpbRead.call(this, offset);
 };
+
+// --- DMA: the abort register reads as zero once the channels have stopped --------------------------
+// Stock: not readable. Aborting takes no time here.
+const stockDmaRead = RPDMA.prototype.readUint32;
+RPDMA.prototype.readUint32 = function (offset) { return offset === 0x444 ? 0 : stockDmaRead.call(this, offset); };

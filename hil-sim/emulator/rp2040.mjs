@@ -8,6 +8,7 @@ const from = (file) => import(pathToFileURL(path.join(root, 'rp2040js/dist/esm',
 
 export const { RP2040, USBCDC, ConsoleLogger, LogLevel } = await from('index.js');
 export const { RPPIO, StateMachine } = await from('peripherals/pio.js');
+export const { RPDMA } = await from('peripherals/dma.js');
 export const { RPUART } = await from('peripherals/uart.js');
 export const { RPPPB } = await from('peripherals/ppb.js');
 export const { FIFO } = await from('utils/fifo.js');

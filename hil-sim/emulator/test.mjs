@@ -153,6 +153,20 @@ test('DMA with a chain of pointers stops at a null pointer', () => {
   assert.equal(m.mcu.readUint32(DMA + 0x54), RAM + 12, 'the null pointer was read, nothing after it');
 });
 
+test('DMA that is aborted stops, and says so', () => {
+  const m = bench();
+  write(m, sm(0, SHIFTCTRL), (1 << 30) | (3 << 18));
+  write(m, DMA, RAM);
+  write(m, DMA + 4, PIO + 0x10);
+  write(m, DMA + 8, 100);
+  write(m, DMA + 0xc, 1 | (2 << 2) | (1 << 4)); // paced by machine 0, which takes nothing
+  m.run(20);
+  assert.equal(m.mcu.pio[0].machines[0].txFIFO.itemCount, 8);
+  write(m, DMA + 0x444, 1);
+  assert.equal(m.mcu.readUint32(DMA + 0x444), 0);
+  assert.equal(m.mcu.readUint32(DMA + 0xc) & (1 << 24), 0, 'not busy');
+});
+
 test('the UART sends a byte in its time and says when it is full', () => {
   const m = bench(), uart = 0x40034000;
   for (let i = 0; i < 32; i++) write(m, uart, i);

@@ -1,6 +1,6 @@
 //! Hardware in the loop: the emulated Pico, and a board at a port.
 
-use crate::firmware;
+use crate::{datasheet, firmware};
 use crate::steps::{Outcome, Report, cargo, root};
 use std::path::PathBuf;
 use std::process::Command;
@@ -55,7 +55,7 @@ fn emulator_tests() -> Outcome {
 
 fn cases(arguments: &[&str]) -> Outcome {
     let mut command = cargo(&["run", "--quiet", "--locked", "--package", "daic-tests", "--bin", "hil", "--"]);
-    command.args(arguments);
+    command.args(arguments).arg("--numbers").arg(datasheet::numbers());
     command.env("DAIC_PICO_ELF", firmware::elf()).env("DAIC_EMULATOR_MODULES", modules());
     match command.status() {
         Ok(status) if status.success() => Outcome::Passed,
@@ -71,6 +71,9 @@ pub fn pico(report: &mut Report, arguments: &[&str]) {
     if report.last_two_passed() {
         report.step("emulator of the Pico: its own tests", emulator_tests);
         report.step("hardware in the loop: emulated Pico", || cases(arguments));
+        if arguments == ["--target", "pico"] {
+            report.step("numbers of docs/datasheet.md", datasheet::check);
+        }
     } else {
         let why = "needs the image and the emulator above";
         report.step("hardware in the loop: emulated Pico", || Outcome::NotRun(why.into()));
@@ -94,5 +97,14 @@ pub fn hil(arguments: &[&str]) -> Report {
         let with: Vec<&str> = arguments.iter().copied().chain(["--target", "pico"]).collect();
         pico(&mut report, &with);
     }
+    report
+}
+
+/// `cargo xtask datasheet`.
+pub fn datasheet() -> Report {
+    let mut report = Report::default();
+    // Another argument than in a test: what is written is not compared.
+    pico(&mut report, &["--target", "pico", "--filter", ""]);
+    report.step("numbers into docs/datasheet.md", datasheet::write);
     report
 }

@@ -4,6 +4,7 @@
 //! and what could not be run on this machine, with the reason.
 
 mod bench;
+mod datasheet;
 mod firmware;
 mod hil;
 mod steps;
@@ -20,6 +21,7 @@ cargo xtask COMMAND
              controller, on the simulated board, on the emulated Pico, on the board at PORT
   lint       formatting, clippy, documentation without warnings, cargo-deny where installed
   ci         test, then lint
+  datasheet  measures on the emulated Pico and writes the numbers into docs/datasheet.md
   figures    draws the pictures of README and docs anew with the program itself
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders
@@ -42,6 +44,7 @@ fn main() -> ExitCode {
             report.step("firmware for the Pico", firmware::build);
             report
         }
+        ["datasheet"] => hil::datasheet(),
         ["hil", ..] => hil::hil(&words[1..]),
         ["figures"] => steps::figures(),
         ["bench", "correlate"] => bench::correlate(false),

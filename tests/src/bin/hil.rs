@@ -33,6 +33,19 @@ fn targets(names: &[String], port: Option<&str>) -> Result<Vec<Box<dyn Target>>,
     Ok(targets)
 }
 
+/// What the cases measured, as [case, what, value, unit].
+fn write_numbers(file: &str, outcomes: &[(&str, Outcome)]) -> std::io::Result<()> {
+    let mut rows = Vec::new();
+    for (case, outcome) in outcomes {
+        if let Outcome::Passed(numbers) = outcome {
+            rows.extend(numbers.iter().map(|(what, value, unit)| (case, what, value, unit)));
+        }
+    }
+    let beside = format!("{file}.new");
+    std::fs::write(&beside, serde_json::to_string(&rows)?)?;
+    std::fs::rename(&beside, file)
+}
+
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let values = |name: &str| -> Vec<String> {
@@ -56,6 +69,12 @@ fn main() -> ExitCode {
     let mut failed = 0;
     for target in targets {
         let outcomes = run(target, long, &filter);
+        if let Some(file) = values("--numbers").pop()
+            && let Err(error) = write_numbers(&file, &outcomes)
+        {
+            eprintln!("hil: {file}: {error}");
+            return ExitCode::from(2);
+        }
         failed += outcomes.iter().filter(|(_, outcome)| matches!(outcome, Outcome::Failed(_))).count();
     }
     if failed > 0 {

@@ -10,6 +10,9 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 /// Longest time that an answer may take, in ticks (80 ms).
 const PATIENCE: u64 = 10_000_000;
 
+/// From reset until requests are answered, in ticks (5 ms).
+const BOOT: u64 = 625_000;
+
 /// An emulated Pico.
 pub struct Emulator {
     child: Child,
@@ -144,7 +147,7 @@ impl Target for Emulator {
         self.levels = 0;
         self.input(INTERLOCK, true);
         // Until it has booted; with USB until a host has found it.
-        self.run(if usb { 3_000_000 } else { 250_000 }, None);
+        self.run(if usb { 5_000_000 } else { BOOT }, None);
         self.words.clear();
         self.received = Default::default();
     }
@@ -174,7 +177,7 @@ impl Bench for Emulator {
     fn power_cycle(&mut self) {
         self.dead = false;
         self.command(&json!({ "op": "power" }));
-        self.run(250_000, None);
+        self.run(BOOT, None);
         self.received = Default::default();
     }
 

@@ -7,6 +7,7 @@
 #![no_main]
 
 mod clock;
+mod flash;
 mod player;
 mod reg;
 mod reset;
@@ -19,7 +20,7 @@ use daic_firmware::{Board, Controller, Sink};
 use daic_protocol::message::{Health, State};
 use embedded_hal::pwm::SetDutyCycle;
 use hal::Clock;
-use hal::fugit::{ExtU32, RateExtU32};
+use hal::fugit::{MicrosDurationU32, RateExtU32};
 use hal::pac::{self, interrupt};
 use player::Player;
 use rp2040_hal as hal;
@@ -32,7 +33,7 @@ use usb_device::bus::UsbBusAllocator;
 static BOOT2_FIRMWARE: [u8; 256] = rp2040_boot2::BOOT_LOADER_W25Q080;
 
 /// A turn of the main loop that takes longer than this resets the board.
-const WATCHDOG_MS: u32 = 500;
+const WATCHDOG: MicrosDurationU32 = MicrosDurationU32::millis(500);
 
 /// What the controller reaches directly: levels at their time; words are the player's.
 struct Direct<'a> {
@@ -71,7 +72,7 @@ fn main() -> ! {
     ) else {
         unreachable!()
     };
-    watchdog.start(WATCHDOG_MS.millis());
+    watchdog.start(WATCHDOG);
     let sio = hal::Sio::new(p.SIO);
     let pins = hal::gpio::Pins::new(p.IO_BANK0, p.PADS_BANK0, sio.gpio_bank0, &mut p.RESETS);
     p.RESETS.reset().modify(|_, w| w.dma().clear_bit().pio0().clear_bit().pio1().clear_bit());
@@ -125,7 +126,7 @@ fn main() -> ! {
     // SAFETY: the handler below shares nothing but atomics.
     unsafe { pac::NVIC::unmask(pac::Interrupt::IO_IRQ_BANK0) };
 
-    let noise = (0..32).fold(0u32, |bits, _| (bits << 1) | u32::from(p.ROSC.randombit().read().bits() & 1 != 0));
+    let noise = (0..32).fold(0u32, |bits, _| (bits << 1) | u32::from(p.ROSC.randombit().read().randombit().bit()));
     // Another one at every boot: noise of the ring oscillator, and the count since power came.
     let boot_id = noise.wrapping_add(boots.wrapping_mul(0x9e37_79b9));
     let Some(controller) = cortex_m::singleton!(: Controller = Controller::new(Board::pico(), boot_id)) else {
