@@ -125,5 +125,7 @@ fn cause_text(cause: FaultCause) -> &'static str {
         FaultCause::Aborted => "a host asked it to abort",
         FaultCause::Underrun => "its player ran dry",
         FaultCause::Internal => "the program broke a rule while running",
+        FaultCause::Interlock => "its interlock input opened",
+        FaultCause::Heartbeat => "its processor did not report in time",
     }
 }

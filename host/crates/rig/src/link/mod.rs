@@ -406,6 +406,7 @@ fn unexpected(request: &Request, reply: &Reply) -> LinkError {
         Reply::Done { .. } => "Done",
         Reply::Refused(_) => "Refused",
         Reply::Events(_) => "Events",
+        Reply::Health(_) => "Health",
         Reply::Clock { .. } => "Clock",
     };
     LinkError::Unexpected { request: name(request), reply }
@@ -426,5 +427,6 @@ fn name(request: &Request) -> &'static str {
         Request::ClearFault => "ClearFault",
         Request::ReadEvents { .. } => "ReadEvents",
         Request::Clock => "Clock",
+        Request::Health => "Health",
     }
 }
