@@ -81,16 +81,14 @@ impl Packer {
 
     /// The run is over at `tick` and the safe word stands: fills the block, and one more, so that
     /// whatever looks ahead in the player finds the safe word.
-    ///
-    /// # Errors
-    /// [`TooClose`] to the word before.
-    pub fn finish(&mut self, tick: u64, out: &mut dyn FnMut(&Block)) -> Result<(), TooClose> {
-        self.word(tick, SAFE_WORD, out)?;
+    pub fn finish(&mut self, tick: u64, out: &mut dyn FnMut(&Block)) {
+        // What is left to the end may be too short for a record; the safe word stands either way.
+        self.hold(tick, out);
+        self.word = SAFE_WORD;
         let left = BLOCK.saturating_sub(self.records.len());
         for _ in 0..left.saturating_add(BLOCK) {
             self.push(MIN_STEP_TICKS, out);
         }
-        Ok(())
     }
 
     /// Records of the word that stands, up to `until`.

@@ -110,7 +110,7 @@ proptest! {
             wanted.push((tick, word));
         }
         tick += 100;
-        packer.finish(tick, &mut take).unwrap();
+        packer.finish(tick, &mut take);
         wanted.push((tick, 0));
         let mut at = start;
         let mut got: Vec<(u64, u32)> = Vec::new();

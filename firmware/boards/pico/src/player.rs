@@ -57,6 +57,8 @@ const BUFFERS: usize = 128;
 const SLOTS: usize = 256;
 /// How far ahead words are expanded: 20 ms.
 pub const LOOK_AHEAD: u64 = 2_500_000;
+/// Longest time spent on looking ahead in one turn of the main loop: 0.5 ms.
+const FILL: u64 = 62_500;
 /// From the launch to the first tick of a program: 200 µs of the safe word.
 const LEAD_IN: u64 = 25_000;
 /// Time kept for the launch itself: 100 µs.
@@ -211,6 +213,9 @@ impl Player {
     /// Nothing under way, outputs safe, machines at their entries and standing still.
     fn clear(&mut self) {
         write(PIO0, 0);
+        // Disabled first: a channel that is only aborted may be started again by the other.
+        write(DMA + 0x10, 0);
+        write(DMA + 0x40 + 0x10, 0);
         write(DMA + 0x444, 3); // abort both channels
         while read(DMA + 0x444) & 3 != 0 {}
         for m in [PLAY, PULSE, GUARD] {
@@ -276,7 +281,7 @@ impl Player {
         if self.run.as_ref().is_none_or(|run| run.number != controller.run()) {
             self.begin(controller, sink);
         }
-        self.fill(controller, u64::MAX);
+        self.fill(controller, clock::now().saturating_add(FILL));
         if let Some((cause, tick)) = self.tripped() {
             controller.trip(cause, tick, sink);
         }
@@ -322,10 +327,6 @@ impl Player {
             if steps % 4 == 0 && clock::now() > deadline {
                 break;
             }
-            // Often enough that links and events are served in between.
-            if steps > 256 && deadline == u64::MAX {
-                break;
-            }
             let due = run.ahead.due();
             let quiet = run.packer.upto().saturating_add(8 * u64::from(MAX_HOLD));
             if due > quiet {
@@ -338,8 +339,7 @@ impl Player {
             match reached {
                 Reached::Waiting(_) if !broken => {}
                 Reached::Ended(tick) if !broken => {
-                    // An end later than the tick asked for comes back with the safe word packed.
-                    let _ = run.packer.finish(tick.max(run.packer.upto()), &mut |block| ring.commit(block));
+                    run.packer.finish(tick, &mut |block| ring.commit(block));
                     run.complete = true;
                 }
                 // The player runs dry where the words end, and says so.
