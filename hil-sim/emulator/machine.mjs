@@ -4,7 +4,7 @@ import { RP2040, USBCDC, ConsoleLogger, LogLevel } from './rp2040.mjs';
 import * as bootrom from './bootrom.mjs';
 
 const TICK_NS = 8, TOP_OF_RAM = 0x20041000, FLASH = 0x10000000;
-const WATCHDOG = 0x40058;
+const WATCHDOG = 0x40058, ROSC = 0x40060, RANDOM_BIT = 0x1c;
 /** Ticks of a byte on the UART at 1 Mbaud. */
 export const BYTE_TICKS = 1250;
 
@@ -71,6 +71,14 @@ export class Machine {
       watchdog.alarm.enable = false;
       watchdog.timer.enable = false;
       this.resetting = true;
+    };
+    // Noise that is another at every boot, and the same in every run.
+    let noise = (this.boots + 1) * 0x9e3779b1;
+    const rosc = mcu.peripherals[ROSC], stockRosc = rosc.readUint32.bind(rosc);
+    rosc.readUint32 = (offset) => {
+      if (offset !== RANDOM_BIT) return stockRosc(offset);
+      noise = (Math.imul(noise, 1664525) + 1013904223) >>> 0;
+      return noise >>> 31;
     };
     mcu.uart[0].onByte = (byte) => this.sent.uart.push(byte);
     mcu.gpio.forEach((pin, gpio) => {

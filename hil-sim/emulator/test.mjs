@@ -276,6 +276,14 @@ test('the watchdog resets once, RAM and scratch registers stay', () => {
   assert.equal(m.mcu.sram[100], 7);
 });
 
+test('the noise of the ring oscillator is another at every boot', () => {
+  const noise = (m) => Array.from({ length: 32 }, () => m.mcu.readUint32(0x4006001c)).join('');
+  const m = bench(), first = noise(m);
+  m.reset();
+  assert.notEqual(noise(m), first);
+  assert.equal(noise(bench()), first, 'and the same in every run');
+});
+
 test('a reset lets go of every output at once', () => {
   const m = bench();
   blink(m, 20, 20);

@@ -59,7 +59,7 @@ impl Emulator {
         Ok(emulator)
     }
 
-    fn link(&self) -> &'static str {
+    fn link_name(&self) -> &'static str {
         if self.usb { "usb" } else { "uart" }
     }
 
@@ -117,7 +117,7 @@ impl Target for Emulator {
 
     fn exchange(&mut self, frame: &[u8]) -> Vec<u8> {
         let hex: String = frame.iter().map(|byte| format!("{byte:02x}")).collect();
-        let link = self.link();
+        let link = self.link_name();
         self.received[usize::from(self.usb)].clear();
         self.command(&json!({ "op": "send", "link": link, "hex": hex }));
         self.run(PATIENCE, Some(link));
