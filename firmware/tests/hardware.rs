@@ -149,7 +149,9 @@ fn two_links() {
     let mut rig = Rig::new(Board::reference());
     let mut gates = [FrameGate::new(), FrameGate::new()];
     let streams: Vec<Vec<u8>> = (0..2u32)
-        .map(|link| (0..50).flat_map(|n| encode_request(1000 * link + n, &Request::Status).unwrap()).collect())
+        .map(|link| {
+            (0..50).flat_map(|n| encode_request(1000 * link + n, &Request::Status).unwrap()).collect()
+        })
         .collect();
     let mut answered = [0, 0];
     let (mut at, mut turn) = ([0usize, 0], 1usize);
@@ -202,7 +204,8 @@ fn lines_and_pins() {
     assert_eq!(LINES.iter().map(|line| 1 << line.0).sum::<u32>(), all);
     for bit in 0..32 {
         let pins = pin_word(1 << bit);
-        let expected: u32 = LINES.iter().filter(|line| line.0 == bit).map(|line| 1 << (line.1 - OUT_BASE)).sum();
+        let expected: u32 =
+            LINES.iter().filter(|line| line.0 == bit).map(|line| 1 << (line.1 - OUT_BASE)).sum();
         // LED 0 shows on the board too.
         let onboard = if bit == 0 { 1 << (ONBOARD - OUT_BASE) } else { 0 };
         assert_eq!(pins, expected | onboard, "bit {bit}");
@@ -221,7 +224,10 @@ fn a_trip_ends_the_run() {
     let words: Vec<_> = rig.out.words.iter().map(|&(t, w)| (t - start, w)).collect();
     assert_eq!(words, [(1000, 0x100), (2000, 0), (3000, 0x100), (3500, 0)]);
     let last = rig.events().pop().unwrap();
-    assert_eq!((last.tick, last.kind), (start + 3500, EventKind::Faulted { cause: FaultCause::Interlock, instruction: 3 }));
+    assert_eq!(
+        (last.tick, last.kind),
+        (start + 3500, EventKind::Faulted { cause: FaultCause::Interlock, instruction: 3 })
+    );
     // Only of a run.
     rig.done(Request::ClearFault);
     rig.controller.trip(FaultCause::Heartbeat, start + 9000, &mut rig.out);

@@ -76,7 +76,8 @@ fn written(block: &str) -> Vec<Row> {
 
 /// Whether a number is the one written; those that the compiler decides may differ a little.
 fn agrees(now: &Row, then: &Row) -> bool {
-    let by_compiler = now.2 == "bytes" || ["least lead", "longest turn", "halt to safe", "late by"].iter().any(|w| now.0.contains(w));
+    let by_compiler = now.2 == "bytes"
+        || ["least lead", "longest turn", "halt to safe", "late by"].iter().any(|w| now.0.contains(w));
     let allowed = if by_compiler { COMPILER * then.1.abs().max(100.0) } else { 0.0 };
     now.0 == then.0 && now.2 == then.2 && (now.1 - then.1).abs() <= allowed
 }
@@ -88,7 +89,11 @@ pub fn check() -> Outcome {
         let (_, block, _) = split(&text).ok_or("no marks in docs/datasheet.md")?;
         let written = written(block);
         if written.len() != rows.len() {
-            return Err(format!("{} numbers measured, {} written: `cargo xtask datasheet`", rows.len(), written.len()));
+            return Err(format!(
+                "{} numbers measured, {} written: `cargo xtask datasheet`",
+                rows.len(),
+                written.len()
+            ));
         }
         match rows.iter().zip(&written).find(|(now, then)| !agrees(now, then)) {
             None => Ok(()),

@@ -51,7 +51,8 @@ pub fn build() -> Outcome {
     // A directory of its own: the compiler may be another than the one that built the rest.
     let target = root().join("target/pico");
     let manifest = root().join("firmware/boards/pico/Cargo.toml");
-    let mut build = cargo(&["build", "--locked", "--release", "--target", "thumbv6m-none-eabi", "--manifest-path"]);
+    let mut build =
+        cargo(&["build", "--locked", "--release", "--target", "thumbv6m-none-eabi", "--manifest-path"]);
     build.arg(manifest).env("CARGO_TARGET_DIR", &target).envs(environment);
     match build.status() {
         Ok(status) if status.success() => {}
@@ -168,7 +169,9 @@ impl<'a> Elf<'a> {
                 let name = self.bytes.get(strings + self.word(symbol) as usize..).unwrap_or(&[]);
                 let name: Vec<u8> = name.iter().copied().take_while(|&b| b != 0).collect();
                 let name = String::from_utf8_lossy(&name);
-                if function && ["panic", "unwrap_failed", "expect_failed"].iter().any(|word| name.contains(word)) {
+                if function
+                    && ["panic", "unwrap_failed", "expect_failed"].iter().any(|word| name.contains(word))
+                {
                     names.insert(readable(&name));
                 }
             }
@@ -186,8 +189,12 @@ fn readable(mangled: &str) -> String {
         let digits = rest.find(|c: char| !c.is_ascii_digit()).unwrap_or(rest.len());
         let length: usize = rest[..digits].parse().unwrap_or(0);
         // The newer mangling puts `_` before a name that begins with a digit or `_`.
-        let body = rest[digits..].strip_prefix('_').filter(|_| mangled.starts_with("_R")).unwrap_or(&rest[digits..]);
-        let is_name = length > 1 && body.get(..length).is_some_and(|n| n.chars().all(|c| c.is_ascii_alphanumeric() || "_$.".contains(c)));
+        let body =
+            rest[digits..].strip_prefix('_').filter(|_| mangled.starts_with("_R")).unwrap_or(&rest[digits..]);
+        let is_name = length > 1
+            && body
+                .get(..length)
+                .is_some_and(|n| n.chars().all(|c| c.is_ascii_alphanumeric() || "_$.".contains(c)));
         if is_name {
             let name = &body[..length];
             let hash = name.len() == 17 && name.starts_with('h');
@@ -231,7 +238,8 @@ mod tests {
     #[test]
     fn uf2_blocks() {
         let bytes: Vec<u8> = (0..300).map(|i| i as u8).collect();
-        let file = uf2(&[(0x1000_0000, &bytes[..256]), (0x1000_0100, &bytes[256..]), (0x1000_1010, &[7])]).unwrap();
+        let file =
+            uf2(&[(0x1000_0000, &bytes[..256]), (0x1000_0100, &bytes[256..]), (0x1000_1010, &[7])]).unwrap();
         assert_eq!(file.len(), 3 * 512);
         let word = |at: usize| u32::from_le_bytes(file[at..at + 4].try_into().unwrap());
         for (block, address) in [(0, 0x1000_0000), (1, 0x1000_0100), (2, 0x1000_1000)] {
@@ -252,7 +260,10 @@ mod tests {
     #[test]
     fn names_are_readable() {
         assert_eq!(readable("_ZN4core9panicking9panic_fmt17h0123456789abcdefE"), "panicking::panic_fmt");
-        assert_eq!(readable("_RNvNtCsabc_4core9panicking18panic_bounds_check"), "panicking::panic_bounds_check");
+        assert_eq!(
+            readable("_RNvNtCsabc_4core9panicking18panic_bounds_check"),
+            "panicking::panic_bounds_check"
+        );
         assert_eq!(readable("rust_begin_unwind"), "rust_begin_unwind");
     }
 }

@@ -1,7 +1,7 @@
 //! Hardware in the loop: the emulated Pico, and a board at a port.
 
-use crate::{datasheet, firmware};
 use crate::steps::{Outcome, Report, cargo, root};
+use crate::{datasheet, firmware};
 use std::path::PathBuf;
 use std::process::Command;
 

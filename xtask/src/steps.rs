@@ -92,6 +92,11 @@ pub fn test() -> Report {
 pub fn lint() -> Report {
     let mut report = Report::default();
     report.step("formatting", || outcome_of(cargo(&["fmt", "--all", "--check"])));
+    report.step("formatting of the Pico's program", || {
+        let mut command = cargo(&["fmt", "--check", "--manifest-path"]);
+        command.arg(root().join("firmware/boards/pico/Cargo.toml"));
+        outcome_of(command)
+    });
     report.step("clippy", || {
         outcome_of(cargo(&["clippy", "--workspace", "--all-targets", "--locked", "--", "-D", "warnings"]))
     });

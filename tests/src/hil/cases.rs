@@ -61,7 +61,8 @@ fn repeat(count: u32, body: &[Instruction]) -> Vec<Instruction> {
 
 /// Camera trigger, strobe of odd lengths, for each of `count` frames.
 fn strobes(count: u32) -> Vec<Instruction> {
-    let mut program = vec![Instruction::Level { led: 0, level: 40_000 }, Instruction::Settle { ticks: 2500 * US }];
+    let mut program =
+        vec![Instruction::Level { led: 0, level: 40_000 }, Instruction::Settle { ticks: 2500 * US }];
     program.extend(repeat(
         count,
         &[
@@ -99,12 +100,18 @@ fn same_by_events(program: &[Instruction], events: &[Event], start: u64) -> Resu
 
 fn done(ran: &super::host::Ran) -> Result<(), String> {
     let last = ran.events.last().map(|e| e.kind);
-    check(matches!(last, Some(EventKind::RunDone { .. })), || format!("the run ended in {last:?}, {:?}", ran.fault))
+    check(matches!(last, Some(EventKind::RunDone { .. })), || {
+        format!("the run ended in {last:?}, {:?}", ran.fault)
+    })
 }
 
 /// The edges of `ran` are the first of the program's, and then the outputs are safe: returns the
 /// index of the first edge that is not the program's and its tick on the program's timeline.
-fn prefix(program: &[Instruction], edges: &[(u64, u32)], origin: i64) -> Result<(usize, Option<i64>), String> {
+fn prefix(
+    program: &[Instruction],
+    edges: &[(u64, u32)],
+    origin: i64,
+) -> Result<(usize, Option<i64>), String> {
     let wanted = expand(program);
     let got: Vec<(i64, u32)> = edges.iter().map(|&(t, w)| (t as i64 - origin, w)).collect();
     let same = got.iter().zip(&wanted).take_while(|(g, w)| g.0 == w.0 as i64 && g.1 == w.1).count();
@@ -163,7 +170,10 @@ fn shortest(host: &mut Host, _: bool) -> Result<Outcome, String> {
     let aux = 1 << 12;
     let mut program = vec![];
     for _ in 0..3 {
-        program.extend(repeat(20, &[set(aux, 4), clear(aux, 4), set(aux | lamp(1), 5), clear(aux | lamp(1), 6)]));
+        program.extend(repeat(
+            20,
+            &[set(aux, 4), clear(aux, 4), set(aux | lamp(1), 5), clear(aux | lamp(1), 6)],
+        ));
         program.push(Instruction::Delay { ticks: 300 * US });
     }
     exact(host, &program)
@@ -210,7 +220,9 @@ fn one_tick(host: &mut Host, _: bool) -> Result<Outcome, String> {
         for by in [1, -1] {
             let kept = ran.edges[index].0;
             ran.edges[index].0 = kept.wrapping_add_signed(by);
-            check(host.compare(&program, &ran).is_err(), || format!("edge {index} moved by {by}: not found"))?;
+            check(host.compare(&program, &ran).is_err(), || {
+                format!("edge {index} moved by {by}: not found")
+            })?;
             ran.edges[index].0 = kept;
         }
     }
@@ -234,7 +246,8 @@ fn slipped(host: &mut Host, _: bool) -> Result<Outcome, String> {
 }
 
 fn stop(host: &mut Host, _: bool) -> Result<Outcome, String> {
-    let program = repeat(2000, &[set(shutter(), 40 * US), set(lamp(0), 10 * US), clear(shutter() | lamp(0), 30 * US)]);
+    let program =
+        repeat(2000, &[set(shutter(), 40 * US), set(lamp(0), 10 * US), clear(shutter() | lamp(0), 30 * US)]);
     let from = host.status()?.next_event;
     host.start(&program)?;
     host.target.pass(u64::from(5000 * US));
@@ -354,7 +367,10 @@ fn repeated(host: &mut Host, _: bool) -> Result<Outcome, String> {
 /// Something that keeps all kinds of lines busy, for the cases that cut it.
 fn busy() -> Vec<Instruction> {
     let mut body = vec![];
-    body.extend(repeat(10, &[set(shutter() | lamp(0), 13 * US), clear(lamp(0), 7 * US), clear(shutter(), 4)]));
+    body.extend(repeat(
+        10,
+        &[set(shutter() | lamp(0), 13 * US), clear(lamp(0), 7 * US), clear(shutter(), 4)],
+    ));
     body.push(go(0, 6));
     body.extend([set(lamp(1), 50 * US), clear(lamp(1), 400 * US)]);
     body.push(go(0, 0));
@@ -395,7 +411,9 @@ fn interlock(host: &mut Host, long: bool) -> Result<Outcome, String> {
         let (_, safe) = prefix(&program, &edges, origin).map_err(|e| format!("instant {n}: {e}"))?;
         let at = safe.ok_or("no safe word")? + origin;
         worst = worst.max(at - opened);
-        check((1..=INTERLOCK_TICKS).contains(&(at - opened)), || format!("{n}: safe {} ticks later", at - opened))?;
+        check((1..=INTERLOCK_TICKS).contains(&(at - opened)), || {
+            format!("{n}: safe {} ticks later", at - opened)
+        })?;
         // An open interlock permits nothing.
         host.done(&Request::ClearFault)?;
     }
@@ -442,10 +460,14 @@ fn halted(host: &mut Host, long: bool) -> Result<Outcome, String> {
     let mut worst = 0;
     for n in 0..instants {
         let after = u64::from(1100 * US) + n * 104_729 % 1_500_000;
-        let (_, late) = halted_at(host, &program, after).map_err(|e| format!("halt {after} ticks after start: {e}"))?;
+        let (_, late) =
+            halted_at(host, &program, after).map_err(|e| format!("halt {after} ticks after start: {e}"))?;
         worst = worst.max(late);
     }
-    Ok(Outcome::Passed(vec![("instants", instants as f64, ""), ("halt to safe, worst", worst as f64, "ticks")]))
+    Ok(Outcome::Passed(vec![
+        ("instants", instants as f64, ""),
+        ("halt to safe, worst", worst as f64, "ticks"),
+    ]))
 }
 
 fn halted_in_pulse(host: &mut Host, long: bool) -> Result<Outcome, String> {
@@ -462,7 +484,10 @@ fn halted_in_pulse(host: &mut Host, long: bool) -> Result<Outcome, String> {
         check(same == 1, || format!("{same} edges"))?;
         worst = worst.max(late);
     }
-    Ok(Outcome::Passed(vec![("instants", instants as f64, ""), ("halt to safe, worst", worst as f64, "ticks")]))
+    Ok(Outcome::Passed(vec![
+        ("instants", instants as f64, ""),
+        ("halt to safe, worst", worst as f64, "ticks"),
+    ]))
 }
 
 /// What is expanded ahead bridges a processor that is busy elsewhere.
@@ -533,7 +558,9 @@ fn levels(host: &mut Host, _: bool) -> Result<Outcome, String> {
     let from = host.status()?.next_event;
     host.start(&program)?;
     host.target.pass(u64::from(3000 * US));
-    let Some(bench) = host.target.bench() else { return Ok(Outcome::Cannot("levels are not seen from outside")) };
+    let Some(bench) = host.target.bench() else {
+        return Ok(Outcome::Cannot("levels are not seen from outside"));
+    };
     let duty = bench.duty();
     for (index, (got, level)) in duty.iter().zip(wanted).enumerate() {
         let expected = f64::from(level) / 65_535.0;

@@ -75,7 +75,8 @@ impl Emulator {
         self.now = answer["cycle"].as_u64().expect("a count");
         for (index, link) in ["uart", "usb"].into_iter().enumerate() {
             let hex = answer[link].as_str().unwrap_or_default();
-            let bytes = (0..hex.len() / 2).filter_map(|i| u8::from_str_radix(&hex[2 * i..2 * i + 2], 16).ok());
+            let bytes =
+                (0..hex.len() / 2).filter_map(|i| u8::from_str_radix(&hex[2 * i..2 * i + 2], 16).ok());
             self.received[index].extend(bytes);
         }
         for edge in answer["edges"].as_array().into_iter().flatten() {

@@ -115,7 +115,9 @@ fn main() -> ! {
     uart.enable_rx_interrupt();
     serial::start_uart();
     let bus = hal::usb::UsbBus::new(p.USBCTRL_REGS, p.USBCTRL_DPRAM, clocks.usb_clock, true, &mut p.RESETS);
-    if let Some(allocator) = cortex_m::singleton!(: UsbBusAllocator<hal::usb::UsbBus> = UsbBusAllocator::new(bus)) {
+    if let Some(allocator) =
+        cortex_m::singleton!(: UsbBusAllocator<hal::usb::UsbBus> = UsbBusAllocator::new(bus))
+    {
         serial::start_usb(allocator);
     }
     // The interlock: only its falling edge matters here, and only for the tick reported.
@@ -126,10 +128,12 @@ fn main() -> ! {
     // SAFETY: the handler below shares nothing but atomics.
     unsafe { pac::NVIC::unmask(pac::Interrupt::IO_IRQ_BANK0) };
 
-    let noise = (0..32).fold(0u32, |bits, _| (bits << 1) | u32::from(p.ROSC.randombit().read().randombit().bit()));
+    let noise =
+        (0..32).fold(0u32, |bits, _| (bits << 1) | u32::from(p.ROSC.randombit().read().randombit().bit()));
     // Another one at every boot: noise of the ring oscillator, and the count since power came.
     let boot_id = noise.wrapping_add(boots.wrapping_mul(0x9e37_79b9));
-    let Some(controller) = cortex_m::singleton!(: Controller = Controller::new(Board::pico(), boot_id)) else {
+    let Some(controller) = cortex_m::singleton!(: Controller = Controller::new(Board::pico(), boot_id))
+    else {
         unreachable!()
     };
     let mut links = [

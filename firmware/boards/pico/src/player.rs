@@ -78,10 +78,8 @@ struct Memory {
 }
 // SAFETY: written by `Player` alone, of which there is one; the DMA reads.
 unsafe impl Sync for Memory {}
-static MEMORY: Memory = Memory {
-    slots: UnsafeCell::new([0; SLOTS]),
-    blocks: UnsafeCell::new([[0; 2 * BLOCK]; BUFFERS]),
-};
+static MEMORY: Memory =
+    Memory { slots: UnsafeCell::new([0; SLOTS]), blocks: UnsafeCell::new([[0; 2 * BLOCK]; BUFFERS]) };
 
 /// Tick at which the interlock opened, low and high half; both 0: it has not.
 static OPENED: [AtomicU32; 2] = [AtomicU32::new(0), AtomicU32::new(0)];

@@ -78,9 +78,7 @@ pub fn receive(link: Link) -> Option<(u8, Option<u64>)> {
 
 /// Bytes lost for want of room, on both links.
 pub fn lost() -> u32 {
-    critical_section::with(|cs| {
-        FROM_UART.borrow_ref(cs).lost.wrapping_add(FROM_USB.borrow_ref(cs).lost)
-    })
+    critical_section::with(|cs| FROM_UART.borrow_ref(cs).lost.wrapping_add(FROM_USB.borrow_ref(cs).lost))
 }
 
 /// The USB host has opened the port anew.

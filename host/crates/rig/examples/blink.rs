@@ -45,7 +45,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                     println!("done, {words} edges");
                     return Ok(());
                 }
-                EventKind::Faulted { cause, .. } => return Err(format!("the box went safe: {cause:?}").into()),
+                EventKind::Faulted { cause, .. } => {
+                    return Err(format!("the box went safe: {cause:?}").into());
+                }
                 _ => {}
             }
         }
