@@ -71,7 +71,7 @@ fn what_is_stored_is_loaded() {
         let (stored, loaded) = slots.load(slot).unwrap();
         assert_eq!((&loaded[..], stored.tag, stored.length), (&bytes[..], [slot, 1, 2, 3], length as u32));
     }
-    assert_eq!(slots.load(0).unwrap().1, program(0, 1), "slots do not touch one another");
+    assert_eq!(slots.load(0).unwrap().1[..], program(0, 1), "slots do not touch one another");
     slots.erase(1).unwrap();
     assert_eq!(slots.load(1), Err(SlotError::Empty));
     assert_eq!(slots.load(COUNT), Err(SlotError::NoSuchSlot));
@@ -107,7 +107,7 @@ fn a_power_failure_leaves_the_old_program_or_the_new() {
         let bytes = slots.flash().bytes.clone();
         let mut slots = Slots::new(Fragile { bytes, operations: 0, cut: None, stuck: None }, COUNT);
         let (stored, loaded) = slots.load(1).unwrap_or_else(|e| panic!("cut {operation} {part}: {e}"));
-        if loaded == new {
+        if loaded[..] == new {
             assert_eq!(stored.tag, [2; 4]);
             replaced += 1;
         } else {
@@ -117,7 +117,7 @@ fn a_power_failure_leaves_the_old_program_or_the_new() {
         }
         // And the slot can be written as ever.
         slots.store(1, &new, [3; 4]).unwrap();
-        assert_eq!(slots.load(1).unwrap().1, new);
+        assert_eq!(slots.load(1).unwrap().1[..], new);
     }
     // New only if all of the header that counts is written: from half of the last operation on.
     assert_eq!((kept, replaced), (5 * operations - 3, 3));
@@ -135,7 +135,7 @@ fn a_power_failure_while_emptying_never_brings_back_the_program_before() {
         let mut slots = Slots::new(Fragile { operations: 0, cut, ..flash.clone() }, COUNT);
         let _ = slots.erase(0);
         match slots.load(0) {
-            Ok((_, loaded)) => assert_eq!(loaded, new, "cut {operation} {part}"),
+            Ok((_, loaded)) => assert_eq!(loaded[..], new, "cut {operation} {part}"),
             Err(error) => assert_eq!(error, SlotError::Empty),
         }
     }
@@ -151,7 +151,7 @@ fn worn_out_flash_is_noticed_and_the_old_program_stays() {
     for stuck in [area + PAGE + 300, area + 9] {
         slots.flash().stuck = Some(stuck);
         assert_eq!(slots.store(0, &[0; 600], [2; 4]), Err(SlotError::WriteFailed));
-        assert_eq!(slots.load(0).unwrap().1, old);
+        assert_eq!(slots.load(0).unwrap().1[..], old);
     }
 }
 
@@ -161,6 +161,6 @@ fn many_times() {
     let mut slots = Slots::new(Fragile::new(), 1);
     for n in 0..100u8 {
         slots.store(0, &[n], [n; 4]).unwrap();
-        assert_eq!(slots.load(0).unwrap().1, [n]);
+        assert_eq!(slots.load(0).unwrap().1[..], [n]);
     }
 }
