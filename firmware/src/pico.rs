@@ -62,9 +62,6 @@ pub const fn pin_word(word: u32) -> u32 {
     leds | (cameras << 4) | (auxiliary << 6) | (axes << 10) | (onboard << (ONBOARD - OUT_BASE))
 }
 
-/// Most words per second that the Pico expands for longer than its buffer lasts.
-pub const SUSTAINED_WORDS_PER_S: u32 = 100_000;
-
 impl Board {
     /// A Raspberry Pi Pico: 4 LEDs (10 ms at most, level settled after 2 ms), 2 cameras, 2 axes of
     /// ±50 mm at 6400 steps per millimetre, 5 mm/s, 312.5 mm/s².

@@ -18,6 +18,7 @@ pub const ALL: &[Case] = &[
     Case { name: "identity", run: identity },
     Case { name: "strobe and camera", run: strobe },
     Case { name: "shortest steps", run: shortest },
+    Case { name: "sustained rate", run: sustained },
     Case { name: "moves and strobes", run: moves },
     Case { name: "10 000 edges", run: many_edges },
     Case { name: "one tick wrong is found", run: one_tick },
@@ -171,12 +172,39 @@ fn shortest(host: &mut Host, _: bool) -> Result<Outcome, String> {
     let mut program = vec![];
     for _ in 0..3 {
         program.extend(repeat(
-            20,
+            10,
             &[set(aux, 4), clear(aux, 4), set(aux | lamp(1), 5), clear(aux | lamp(1), 6)],
         ));
-        program.push(Instruction::Delay { ticks: 300 * US });
+        // The processor expands the next ones meanwhile.
+        program.push(Instruction::Delay { ticks: 1500 * US });
     }
     exact(host, &program)
+}
+
+/// The highest rate of edges that goes on for longer than anything is buffered.
+fn sustained(host: &mut Host, _: bool) -> Result<Outcome, String> {
+    if host.target.bench().is_none() {
+        return Ok(Outcome::Cannot("nothing is expanded ahead of time"));
+    }
+    let aux = 1 << 12;
+    for step in [4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 40, 50, 100].map(|us: u32| us * US) {
+        host.restart();
+        let program = repeat(1500, &[set(aux, step), clear(aux, step)]);
+        let ran = host.play(&program)?;
+        match ran.fault.map(|fault| fault.cause) {
+            None => {
+                host.compare(&program, &ran)?;
+                return Ok(Outcome::Passed(vec![("edges per second", f64::from(125_000_000 / step), "")]));
+            }
+            Some(FaultCause::Underrun) => {
+                // Too fast: what came out is the beginning of the program.
+                let edges = host.recorded().to_vec();
+                prefix(&program, &edges, origin(host, &program)?)?;
+            }
+            Some(other) => return Err(format!("{other:?} at steps of {step} ticks")),
+        }
+    }
+    Err("no rate can be sustained".into())
 }
 
 fn moves(host: &mut Host, long: bool) -> Result<Outcome, String> {
@@ -231,12 +259,12 @@ fn one_tick(host: &mut Host, _: bool) -> Result<Outcome, String> {
 
 /// A real fault of one tick: the player does not get one of its clocks.
 fn slipped(host: &mut Host, _: bool) -> Result<Outcome, String> {
-    let program = strobes(4);
+    let program = strobes(12);
     let from = host.status()?.next_event;
     host.start(&program)?;
     let Some(bench) = host.target.bench() else { return Ok(Outcome::Cannot(NO_BENCH)) };
-    // In the middle of the program: after the settling, before the last strobe.
-    let at = bench.now() + u64::from(1000 * US + 2500 * US + 200 * US);
+    // After the settling (2.5 ms), before the last strobe (4.3 ms), wherever in the lead the reply came.
+    let at = bench.now() + u64::from(3400 * US);
     bench.slip(at);
     let ran = host.finish(from, 125_000, 10_000_000)?;
     match host.compare(&program, &ran) {

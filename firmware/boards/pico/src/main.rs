@@ -7,7 +7,6 @@
 #![no_main]
 
 mod clock;
-mod flash;
 mod player;
 mod reg;
 mod reset;

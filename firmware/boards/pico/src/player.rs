@@ -63,6 +63,8 @@ const FILL: u64 = 62_500;
 const LEAD_IN: u64 = 25_000;
 /// Time kept for the launch itself: 100 µs.
 const LAUNCH_MARGIN: u64 = 12_500;
+/// Time before the launch in which no word is expanded any more: planning a move takes long.
+const LAST_FILL: u64 = 50_000;
 /// From the reading of the core's timer for which the launch is set to the first word on the pins.
 const LAUNCH_DELAY: u64 = 3;
 /// Turns of three ticks that the processor may be silent: 5 ms.
@@ -296,7 +298,7 @@ impl Player {
             controller.trip(FaultCause::Interlock, clock::now(), sink);
             return;
         }
-        self.fill(controller, launch.saturating_sub(LAUNCH_MARGIN));
+        self.fill(controller, launch.saturating_sub(LAST_FILL));
         write(DMA + 0x430, 2); // start channel 1
         // It fills the FIFO meanwhile.
         while clock::now().saturating_add(LAUNCH_MARGIN) < launch {}
@@ -319,10 +321,8 @@ impl Player {
         }
         let until = now.saturating_add(LOOK_AHEAD);
         // A step never fills more than three blocks.
-        let mut steps = 0u32;
         while !run.complete && ring.free() >= 4 && run.packer.upto() < until {
-            steps = steps.wrapping_add(1);
-            if steps % 4 == 0 && clock::now() > deadline {
+            if clock::now() > deadline {
                 break;
             }
             let due = run.ahead.due();

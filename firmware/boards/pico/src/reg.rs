@@ -2,8 +2,6 @@
 
 /// PIO block 0, whose machines drive and guard the outputs.
 pub const PIO0: u32 = 0x5020_0000;
-/// PIO block 1, whose machines stamp the inputs.
-pub const PIO1: u32 = 0x5030_0000;
 /// DMA controller.
 pub const DMA: u32 = 0x5000_0000;
 /// Functions of the pins.
@@ -21,8 +19,6 @@ pub const SYST_CVR: u32 = 0xe000_e018;
 
 /// Alias of a register that sets bits.
 pub const SET: u32 = 0x2000;
-/// Alias of a register that clears bits.
-pub const CLEAR: u32 = 0x3000;
 
 /// Reads a register.
 #[inline(always)]
