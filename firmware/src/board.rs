@@ -39,7 +39,13 @@ pub struct Board {
     pub leds: heapless::Vec<LedLimits, 8>,
     /// Camera trigger lines present.
     pub cameras: u8,
+    /// Ticks from the reception of `Start` to the first tick of the program: time for a player in
+    /// hardware to be filled.
+    pub start_lead: u64,
 }
+
+/// [`Board::start_lead`] of a board that needs no more (1 ms).
+pub const START_LEAD: u64 = 125_000;
 
 /// Ticks per microsecond.
 const TICKS_PER_MICROSECOND: u32 = TICK_HZ / 1_000_000;
@@ -57,6 +63,7 @@ impl Board {
             axes: heapless::Vec::from_array([axis; 3]),
             leds: heapless::Vec::from_array([led; 4]),
             cameras: 2,
+            start_lead: START_LEAD,
         }
     }
 

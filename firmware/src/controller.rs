@@ -11,10 +11,6 @@ use daic_protocol::frame::{Decoder, Fed, FrameBytes, TooLarge, encode_reply};
 use daic_protocol::limits::*;
 use daic_protocol::message::*;
 
-/// Ticks from the reception of `Start` to the first tick of the program (1 ms): time for a player
-/// in hardware to be filled.
-pub const START_LEAD: u64 = 125_000;
-
 /// The controller.
 #[derive(Debug)]
 pub struct Controller {
@@ -372,7 +368,7 @@ impl Controller {
         if self.state != State::Armed {
             return self.wrong_state();
         }
-        let start = self.now.max(self.out.last()).saturating_add(START_LEAD);
+        let start = self.now.max(self.out.last()).saturating_add(self.board.start_lead);
         self.player = Some((Player::new(start), false));
         self.run = self.run.wrapping_add(1);
         self.state = State::Running;

@@ -36,8 +36,8 @@ mod timeline;
 pub mod verifier;
 
 pub use ahead::{Ahead, Reached};
-pub use board::{AxisLimits, Board, LedLimits};
-pub use controller::{Controller, START_LEAD};
+pub use board::{AxisLimits, Board, LedLimits, START_LEAD};
+pub use controller::Controller;
 pub use replies::READ_CACHE;
 
 /// Where the controller puts what it plays, in order of ticks.

@@ -74,6 +74,8 @@ impl Board {
             axes: heapless::Vec::from_array([axis; AXES as usize]),
             leds: heapless::Vec::from_array([led; LEDS as usize]),
             cameras: CAMERAS,
+            // 10 ms: some 450 words, so that a burst at the beginning does not outrun the processor.
+            start_lead: TICK_HZ as u64 / 100,
         }
     }
 }

@@ -429,5 +429,6 @@ fn board(config: &BoardConfig) -> Board {
             .map(|l| LedLimits { max_pulse: l.max_pulse, settle: l.settle })
             .collect(),
         cameras: config.cameras,
+        start_lead: daic_firmware::START_LEAD,
     }
 }

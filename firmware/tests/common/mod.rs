@@ -157,6 +157,7 @@ pub fn small_board() -> Board {
         axes: heapless::Vec::from_array([axis; 2]),
         leds: heapless::Vec::from_array([led; 2]),
         cameras: 1,
+        start_lead: daic_firmware::START_LEAD,
     }
 }
 

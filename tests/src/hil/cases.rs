@@ -197,9 +197,11 @@ fn sustained(host: &mut Host, _: bool) -> Result<Outcome, String> {
                 return Ok(Outcome::Passed(vec![("edges per second", f64::from(125_000_000 / step), "")]));
             }
             Some(FaultCause::Underrun) => {
-                // Too fast: what came out is the beginning of the program.
+                // Too fast: what came out is the beginning of the program, and the outputs are safe
+                // from the planned end of its last record on.
                 let edges = host.recorded().to_vec();
-                prefix(&program, &edges, origin(host, &program)?)?;
+                let (_, early) = prefix(&program, &edges, origin(host, &program)?)?;
+                check(early.is_none(), || format!("safe at {early:?}, between two edges"))?;
             }
             Some(other) => return Err(format!("{other:?} at steps of {step} ticks")),
         }
@@ -278,7 +280,7 @@ fn stop(host: &mut Host, _: bool) -> Result<Outcome, String> {
         repeat(2000, &[set(shutter(), 40 * US), set(lamp(0), 10 * US), clear(shutter() | lamp(0), 30 * US)]);
     let from = host.status()?.next_event;
     host.start(&program)?;
-    host.target.pass(u64::from(5000 * US));
+    host.target.pass(u64::from(15_000 * US));
     let state = match host.request(&Request::Stop)? {
         Reply::Done { state } => state,
         // Where time is that of the host alone the run may be over by now.
@@ -309,7 +311,7 @@ fn abort(host: &mut Host, _: bool) -> Result<Outcome, String> {
     let program = repeat(5000, &[set(shutter() | lamp(1), 20 * US), clear(shutter() | lamp(1), 30 * US)]);
     let from = host.status()?.next_event;
     host.start(&program)?;
-    host.target.pass(u64::from(3000 * US));
+    host.target.pass(u64::from(13_000 * US));
     host.done(&Request::Abort)?;
     let ran = host.finish(from, 125_000, 2_000_000)?;
     let last = ran.events.last().map(|e| e.kind);

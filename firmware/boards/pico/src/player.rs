@@ -66,7 +66,7 @@ const LAUNCH_MARGIN: u64 = 12_500;
 /// Time before the launch in which no word is expanded any more: planning a move takes long.
 const LAST_FILL: u64 = 50_000;
 /// From the reading of the core's timer for which the launch is set to the first word on the pins.
-const LAUNCH_DELAY: u64 = 3;
+const LAUNCH_DELAY: u64 = 14;
 /// Turns of three ticks that the processor may be silent: 5 ms.
 const BUDGET: u32 = 208_000;
 /// Longest time from the last report of the processor to the safe word.
