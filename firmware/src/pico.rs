@@ -23,10 +23,6 @@ pub const ONBOARD: u8 = 25;
 pub const LEVEL: [u8; 4] = [16, 17, 18, 19];
 /// GPIO of the interlock: high permits, low (or an open wire) makes every output safe.
 pub const INTERLOCK: u8 = 20;
-/// GPIOs of the trigger inputs.
-pub const INPUTS: [u8; 4] = [21, 22, 26, 27];
-/// GPIO of the start button of the stored program: falling edge starts it.
-pub const BUTTON: u8 = 28;
 
 /// Pins that the player drives, [`OUT_BASE`] first: the lines, nothing, the on-board LED.
 pub const OUT_PINS: u8 = ONBOARD - OUT_BASE + 1;

@@ -77,7 +77,9 @@ fn written(block: &str) -> Vec<Row> {
 /// Whether a number is the one written; those that the compiler decides may differ a little.
 fn agrees(now: &Row, then: &Row) -> bool {
     let by_compiler = now.2 == "bytes"
-        || ["least lead", "longest turn", "halt to safe", "late by"].iter().any(|w| now.0.contains(w));
+        || ["least lead", "longest turn", "halt to safe", "late by", "edges before"]
+            .iter()
+            .any(|w| now.0.contains(w));
     let allowed = if by_compiler { COMPILER * then.1.abs().max(100.0) } else { 0.0 };
     now.0 == then.0 && now.2 == then.2 && (now.1 - then.1).abs() <= allowed
 }

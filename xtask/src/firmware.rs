@@ -169,9 +169,7 @@ impl<'a> Elf<'a> {
                 let name = self.bytes.get(strings + self.word(symbol) as usize..).unwrap_or(&[]);
                 let name: Vec<u8> = name.iter().copied().take_while(|&b| b != 0).collect();
                 let name = String::from_utf8_lossy(&name);
-                if function
-                    && ["panic", "unwrap_failed", "expect_failed"].iter().any(|word| name.contains(word))
-                {
+                if function && ["panic", "_fail"].iter().any(|word| name.contains(word)) {
                     names.insert(readable(&name));
                 }
             }
