@@ -33,6 +33,9 @@ pub enum ConfigError {
         /// Wavelength.
         wavelength_mm: f64,
     },
+    /// A number of the microscope is not allowed.
+    #[error("scene.microscope: {0}")]
+    Microscope(#[from] daic_optics::microscope::MicroscopeError),
     /// The height map cannot be read.
     #[error("the height map {} cannot be read: {cause}", path.display())]
     HeightMap {

@@ -35,11 +35,11 @@ pub struct SimFrame {
 pub struct FrameTruth {
     /// Tick of the trigger edge.
     pub trigger_tick: u64,
-    /// First tick of the exposure.
+    /// First tick of the exposure of row 0.
     pub exposure_start_tick: u64,
-    /// Tick at which the exposure ended.
+    /// Tick at which that exposure ended.
     pub exposure_end_tick: u64,
-    /// Photo-electrons that a pixel of reflectance 1 expects; 0 for a dark frame.
+    /// Photo-electrons that a bare pixel of reflectance 1 expects, the mean over the rows; 0 for a dark frame.
     pub electrons: f64,
     /// Mean position of the stage, weighted by the light; `None` for a dark frame.
     pub stage_mm: Option<[f64; 3]>,
@@ -83,10 +83,19 @@ impl Imager {
         let mut expected = vec![0.0f32; width * height];
         for position in exposure.light.positions() {
             let image = self.render(position.stage_mm);
-            let electrons = position.electrons as f32;
-            expected.par_chunks_mut(width).zip(image.par_chunks(width)).for_each(|(sum, row)| {
-                for (sum, reflectance) in sum.iter_mut().zip(row) {
-                    *sum += electrons * reflectance;
+            expected.par_chunks_mut(width).zip(image.par_chunks(width)).enumerate().for_each(
+                |(y, (sum, row))| {
+                    let electrons = exposure.electrons_of_row(&position, y) as f32;
+                    for (sum, reflectance) in sum.iter_mut().zip(row) {
+                        *sum += electrons * reflectance;
+                    }
+                },
+            );
+        }
+        if let Some(bayer) = &self.config.camera.bayer {
+            expected.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
+                for (x, electrons) in row.iter_mut().enumerate() {
+                    *electrons *= bayer.response_at(x, y) as f32;
                 }
             });
         }
@@ -98,9 +107,12 @@ impl Imager {
         let expected = self.expose(exposure);
         let (width, height) = self.scene.size();
         let positions = exposure.light.positions();
-        let electrons: f64 = positions.iter().map(|p| p.electrons).sum();
+        let light: f64 = positions.iter().map(|p| p.electrons).sum();
         let mean =
-            [0, 1, 2].map(|k| positions.iter().map(|p| p.stage_mm[k] * p.electrons).sum::<f64>() / electrons);
+            [0, 1, 2].map(|k| positions.iter().map(|p| p.stage_mm[k] * p.electrons).sum::<f64>() / light);
+        let rows = if exposure.row_ticks == 0 { 1 } else { height };
+        let of_row = |row| positions.iter().map(|p| exposure.electrons_of_row(p, row)).sum::<f64>();
+        let electrons = (0..rows).map(of_row).sum::<f64>() / rows as f64;
         let stage_mm = match &positions[..] {
             [] => None,
             [one] => Some(one.stage_mm),

@@ -125,27 +125,33 @@ fn steep_cone() {
 #[test]
 fn step_up_and_down() {
     const WALL: f64 = 0.45;
-    for (low, high) in [(0.0, 0.8), (0.6, -0.4)] {
-        let config = SurfaceConfig::Step { x_mm: WALL, low_mm: low, high_mm: high };
+    for (low, high, direction) in [(0.0, 0.8, 0.0), (0.6, -0.4, 0.0), (0.0, 0.8, 1.9)] {
+        let config = SurfaceConfig::Step { x_mm: WALL, low_mm: low, high_mm: high, direction_rad: direction };
         let specimen = SpecimenConfig { surface: config, ..SpecimenConfig::default() };
         let surface = Surface::new(&specimen).expect("valid");
         let (mut levels, mut walls) = (0, 0);
         for line in lines() {
             let [o, d] = [line.origin, line.direction];
-            let x_at = |h: f64| o[0] + (h - o[2]) / d[2] * d[0];
+            // Distance along the direction in which the wall is crossed.
+            let across = |p: [f64; 3]| p[0] * direction.cos() + p[1] * direction.sin();
+            let at = |h: f64| {
+                let t = (h - o[2]) / d[2];
+                [o[0] + t * d[0], o[1] + t * d[1], h]
+            };
             let Some(hit) = surface.first_hit(&line) else { continue };
             let (upper, lower) = (low.max(high), low.min(high));
-            let upper_here = |x: f64| (x >= WALL) == (high > low);
+            let upper_here = |p: [f64; 3]| (across(p) >= WALL) == (high > low);
+            let near = |p: [f64; 3]| (0..2).all(|k| (hit[k] - p[k]).abs() < 1e-12);
             // Expected from where the line passes the two levels.
-            if upper_here(x_at(upper)) {
-                assert!(hit[2] == upper && (hit[0] - x_at(upper)).abs() < 1e-12);
+            if upper_here(at(upper)) {
+                assert!(hit[2] == upper && near(at(upper)));
                 levels += 1;
-            } else if !upper_here(x_at(lower)) {
-                assert!(hit[2] == lower && (hit[0] - x_at(lower)).abs() < 1e-12);
+            } else if !upper_here(at(lower)) {
+                assert!(hit[2] == lower && near(at(lower)));
                 levels += 1;
             } else {
-                assert!(hit[0] == WALL && hit[2] < upper && hit[2] > lower);
-                assert!((x_at(hit[2]) - WALL).abs() < 1e-12);
+                assert!((across(hit) - WALL).abs() < 1e-12 && hit[2] < upper && hit[2] > lower);
+                assert!(near(at(hit[2])));
                 walls += 1;
             }
         }

@@ -32,7 +32,7 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
             times.push(start.elapsed().as_secs_f64());
             let ok: Vec<_> = profile.points.iter().filter(|p| p.status.is_ok()).collect();
             let mean = ok.iter().map(|p| p.point_mm[2]).sum::<f64>() / ok.len() as f64;
-            let sigma = ok.iter().map(|p| p.sigma_mm[2]).sum::<f64>() / ok.len() as f64;
+            let sigma = ok.iter().map(|p| p.sigma_mm()[2]).sum::<f64>() / ok.len() as f64;
             println!(
                 "frame {k}: {} of {} points, mean height {mean:.4} mm, σ {:.2} µm, {:.1} ms",
                 ok.len(),

@@ -4,15 +4,18 @@
 //! (numbers of one's own choice, the same point the same number in every pose), `plate_x_mm`,
 //! `plate_y_mm` (empty where unknown), `minus_x`, `minus_y`, `plus_x`, `plus_y` (pixels, empty where
 //! a view does not show it) and, if not one for all, `sigma_px`. The table of moves, where the stage's are known,
-//! has `pose`, `x_mm`, `y_mm`, `h_mm` against the reference pose (empty where unknown).
+//! has `pose`, `x_mm`, `y_mm`, `h_mm` against the reference pose (empty where unknown) and perhaps `rx_deg`, `ry_deg`,
+//! `rz_deg` with `sigma_deg`: the plate's rotation about x, then y, then z.
 
 use crate::error::Error;
+use crate::optics_file::{self, CalibratedOptics};
 use crate::optics_section;
 use daic_dataset::{Table, atomic};
 use daic_optics::bundle::{Known, PlatePose, Seen, Sighting};
-use daic_optics::{DistortionMaps, RigCalibration, RigData, RigSettings, View, calibrate_rig};
+use daic_optics::{RigCalibration, RigData, RigSettings, View, calibrate_rig};
 use daic_report::{Cell, Chart, Figure, Report, Section, Series, SeriesStyle, TableBlock};
-use daic_rig::experiment::{Covariance, OpticsFile};
+use daic_rig::experiment::{Covariance, OpticsFile, Volume};
+use daic_rig::units::Length;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -75,8 +78,12 @@ pub struct Summary {
     pub chi_square_reduced: f64,
     /// Pixels left out.
     pub rejected: usize,
-    /// Poses predicted without themselves.
+    /// Poses predicted without themselves; one without which the others leave something open is not among them.
     pub left_out: Vec<Predicted>,
+    /// Size of the plate by the moves over its stated size, and its standard deviation, where both are known.
+    pub plate_scale: Option<[f64; 2]>,
+    /// Angles of the stage's axes against the object frame, mrad, where moves are known.
+    pub stage_axes_mrad: Option<[f64; 3]>,
     /// The optics file.
     pub optics: PathBuf,
 }
@@ -86,9 +93,9 @@ pub struct Summary {
 /// # Errors
 /// The file or the value that is to blame, or [`Error::CalibrateRig`].
 pub fn run(options: &Options) -> Result<Summary, Error> {
-    let file = OpticsFile::load(&options.optics)?;
-    let start = optics_section::from_section(&file.optics)?;
-    let (mut data, poses) = read_points(&options.points, options.sigma_px)?;
+    let from = CalibratedOptics::load(&options.optics)?;
+    let (file, start) = (&from.file, from.optics);
+    let (mut data, poses, points) = read_points(&options.points, options.sigma_px)?;
     if let Some(moves) = &options.moves {
         read_moves(moves, options.move_sigma_mm, &poses, &mut data)?;
     }
@@ -105,14 +112,22 @@ pub fn run(options: &Options) -> Result<Summary, Error> {
             }
         })?;
     }
-    let found = calibrate_rig(&start, &DistortionMaps::NONE, &data, &settings)?;
+    let found = calibrate_rig(&start, &from.maps(), &data, &settings).map_err(|source| {
+        let (pose, point) = source.place();
+        let own = |numbers: &[i64], at: Option<usize>| at.and_then(|at| numbers.get(at).copied());
+        let (pose, point) = (own(&poses, pose), own(&points, point));
+        Error::CalibrateRig { path: options.points.clone(), source, pose, point }
+    })?;
     let page = page(&found, &poses)?;
     let path = options.out.join("optics.toml");
-    let text = to_file(&file, &found, poses.len())
-        .to_toml()
-        .map_err(|source| Error::Unwritable { path: path.clone(), reason: source.to_string() })?;
     std::fs::create_dir_all(&options.out)
         .map_err(|source| Error::Folder { path: options.out.clone(), source })?;
+    let mut made = to_file(file, &found, poses.len());
+    let folder = options.optics.parent().unwrap_or(Path::new(""));
+    made.maps = optics_file::moved_maps(file.maps.as_ref(), folder, &options.out)?;
+    let text = made
+        .to_toml()
+        .map_err(|source| Error::Unwritable { path: path.clone(), reason: source.to_string() })?;
     atomic::write_bytes(&path, text.as_bytes())?;
     atomic::write_bytes(&options.out.join("report.html"), page.as_bytes())?;
     Ok(summary(&found, &poses, path))
@@ -122,7 +137,7 @@ pub fn run(options: &Options) -> Result<Summary, Error> {
 ///
 /// # Errors
 /// The file, or the row and column that cannot be used.
-pub fn read_points(path: &Path, sigma_px: f64) -> Result<(RigData, Vec<i64>), Error> {
+pub fn read_points(path: &Path, sigma_px: f64) -> Result<(RigData, Vec<i64>, Vec<i64>), Error> {
     let table = Table::read_csv(path)?;
     let column = |name: &str| table.numbers(name, path);
     let poses = whole(path, "pose", &column("pose")?)?;
@@ -160,13 +175,19 @@ pub fn read_points(path: &Path, sigma_px: f64) -> Result<(RigData, Vec<i64>), Er
         let sighting = Sighting { point, minus: seen(&minus), plus: seen(&plus) };
         data.poses[pose_at[&poses[row]]].sightings.push(sighting);
     }
-    Ok((data, pose_at.into_keys().collect()))
+    Ok((data, pose_at.into_keys().collect(), point_at.into_keys().collect()))
 }
 
 fn read_moves(path: &Path, sigma: f64, poses: &[i64], data: &mut RigData) -> Result<(), Error> {
     let table = Table::read_csv(path)?;
     let numbers = whole(path, "pose", &table.numbers("pose", path)?)?;
     let columns = [table.numbers("x_mm", path)?, table.numbers("y_mm", path)?, table.numbers("h_mm", path)?];
+    // rotations of a goniometer are known to a sigma of their own, or not at all
+    let number = |name: &str| table.numbers(name, path);
+    let turned = match table.column("rx_deg") {
+        Some(_) => Some(([number("rx_deg")?, number("ry_deg")?, number("rz_deg")?], number("sigma_deg")?)),
+        None => None,
+    };
     for (row, number) in numbers.iter().enumerate() {
         let Some(k) = poses.iter().position(|p| p == number) else {
             let (path, value) = (path.to_owned(), *number as f64);
@@ -175,6 +196,13 @@ fn read_moves(path: &Path, sigma: f64, poses: &[i64], data: &mut RigData) -> Res
         };
         data.poses[k].known.translation_mm = [0, 1, 2]
             .map(|i| Some(columns[i][row]).filter(|v| !v.is_nan()).map(|value| Known { value, sigma }));
+        if let Some((angles, sigma_deg)) = &turned {
+            let sigma = sigma_deg[row].to_radians();
+            data.poses[k].known.rotation_rad = [0, 1, 2].map(|i| {
+                let angle = Some(angles[i][row]).filter(|v| !v.is_nan());
+                angle.map(|deg| Known { value: deg.to_radians(), sigma })
+            });
+        }
     }
     Ok(())
 }
@@ -191,6 +219,7 @@ fn whole(path: &Path, column: &'static str, values: &[f64]) -> Result<Vec<i64>, 
 fn to_file(start: &OpticsFile, found: &RigCalibration, poses: usize) -> OpticsFile {
     let names = found.covariance.parameters().iter().map(|p| p.name().to_owned());
     let matrix = found.covariance.matrix();
+    let side = |i: usize| [found.volume.from_mm[i], found.volume.to_mm[i]].map(Length::new);
     OpticsFile {
         format: Some(OpticsFile::FORMAT.to_owned()),
         provenance: Some(format!(
@@ -199,12 +228,14 @@ fn to_file(start: &OpticsFile, found: &RigCalibration, poses: usize) -> OpticsFi
             found.rms_px,
             found.chi_square_reduced
         )),
-        date: Some(humantime::format_rfc3339_seconds(std::time::SystemTime::now()).to_string()),
+        date: Some(crate::camera_file::now()),
         optics: optics_section::to_section(&start.optics, &found.optics),
         covariance: Some(Covariance {
             parameters: names.collect(),
             matrix: matrix.row_iter().map(|row| row.iter().copied().collect()).collect(),
         }),
+        maps: None,
+        volume: Some(Volume { x: side(0), y: side(1), h: side(2) }),
     }
 }
 
@@ -231,6 +262,8 @@ fn summary(found: &RigCalibration, poses: &[i64], optics: PathBuf) -> Summary {
             })
             .collect(),
         left_to_priors: combinations(found),
+        plate_scale: found.plate_scale.map(|s| [s.value, s.sigma]),
+        stage_axes_mrad: found.stage_axes_rad.map(|axes| axes.map(|a| 1e3 * a)),
         rms_px: found.rms_px,
         chi_square_reduced: found.chi_square_reduced,
         rejected: found.rejected.len(),

@@ -160,6 +160,23 @@ impl CameraFile {
                 "field covariance must have {n} rows of {n} numbers, as there are estimates"
             )));
         }
+        let matrix = nalgebra::DMatrix::from_fn(n, n, |i, j| file.covariance[i][j]);
+        let symmetric = (0..n).all(|i| {
+            (0..i).all(|j| {
+                let unit = (matrix[(i, i)] * matrix[(j, j)]).sqrt();
+                (matrix[(i, j)] - matrix[(j, i)]).abs() <= 1e-9 * unit
+            })
+        });
+        let variances = matrix.iter().all(|v| v.is_finite()) && matrix.diagonal().iter().all(|v| *v >= 0.0);
+        if !(symmetric
+            && variances
+            && daic_optics::least_correlation_eigenvalue(&matrix) >= daic_optics::LEAST_EIGENVALUE)
+        {
+            return Err(bad(
+                "field covariance is no covariance: it must be finite, symmetric, without a negative eigenvalue"
+                    .to_owned(),
+            ));
+        }
         if let Some(e) = file.estimates.iter().find(|e| !(e.sigma >= 0.0 && e.value.is_finite())) {
             return Err(bad(format!("field estimates: {} has no valid value and sigma", e.parameter.name())));
         }
@@ -183,37 +200,12 @@ impl CameraFile {
     }
 }
 
-/// The time, UTC, to the second.
+/// The date, UTC.
+pub fn today() -> String {
+    now().chars().take(10).collect()
+}
+
+/// The time, UTC, to the second, as 2025-01-31T12:00:00Z.
 pub fn now() -> String {
-    let seconds = std::time::SystemTime::now()
-        .duration_since(std::time::UNIX_EPOCH)
-        .map_or(0, |d| i64::try_from(d.as_secs()).unwrap_or(0));
-    date(seconds)
-}
-
-/// Seconds since 1970 as a date; days to civil date after Hinnant.
-fn date(seconds: i64) -> String {
-    let (days, rest) = (seconds.div_euclid(86_400), seconds.rem_euclid(86_400));
-    let z = days + 719_468;
-    let era = z.div_euclid(146_097);
-    let day = z.rem_euclid(146_097);
-    let year_of_era = (day - day / 1460 + day / 36_524 - day / 146_096) / 365;
-    let day = day - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
-    let m = (5 * day + 2) / 153;
-    let (d, month) = (day - (153 * m + 2) / 5 + 1, if m < 10 { m + 3 } else { m - 9 });
-    let year = year_of_era + era * 400 + i64::from(month <= 2);
-    format!("{year:04}-{month:02}-{d:02}T{:02}:{:02}:{:02}Z", rest / 3600, rest / 60 % 60, rest % 60)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::date;
-
-    #[test]
-    fn dates() {
-        assert_eq!(date(0), "1970-01-01T00:00:00Z");
-        assert_eq!(date(951_782_399), "2000-02-28T23:59:59Z");
-        assert_eq!(date(951_782_400), "2000-02-29T00:00:00Z");
-        assert_eq!(date(1_735_689_600), "2025-01-01T00:00:00Z");
-    }
+    humantime::format_rfc3339_seconds(std::time::SystemTime::now()).to_string()
 }

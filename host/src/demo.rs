@@ -1,6 +1,7 @@
 //! The whole instrument against the simulated rig: a commanded move comes back as a measured one.
 
 use crate::error::Error;
+use crate::measure::Spread;
 use crate::optics_section;
 use crate::process::{self, Check, FrameCounts, Summary};
 use crate::progress::Progress;
@@ -11,6 +12,7 @@ use daic_hil_sim::config::SimConfig;
 use daic_hil_sim::rig::SimRig;
 use daic_hil_sim::transport::Transport;
 use daic_optics::Optics;
+use daic_optics::microscope::RayMicroscope;
 use daic_rig::acquire::AcquireOptions;
 use daic_rig::experiment::{self, Experiment, MoveStep, Role, Step};
 use daic_rig::link::Link;
@@ -27,9 +29,28 @@ const MOVE_LIMIT_UM: [f64; 3] = [1.0, 1.0, 2.0];
 /// that is 0.1 % wrong gives 150.
 const PROFILE_LIMIT_UM: f64 = 1.0;
 
+/// Limits under the microscope: measured minus commanded displacement, RMS over the field (x, y, h).
+const MICROSCOPE_MOVE_LIMIT_UM: [f64; 3] = [0.01, 0.01, 0.03];
+/// Measured height minus the specimen's formula, both from their means, RMS over the field.
+const MICROSCOPE_PROFILE_LIMIT_UM: f64 = 0.02;
+/// β₁ and β₂ against those of the simulated geometry.
+const BETA_LIMIT: f64 = 2e-3;
+
+/// What is simulated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Scene {
+    /// The macro set-up: one camera behind a grating.
+    #[default]
+    Macro,
+    /// The microscope.
+    Microscope,
+}
+
 /// What `daic demo` is asked for.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
+    /// What is simulated.
+    pub scene: Scene,
     /// Folder of the dataset.
     pub out: PathBuf,
     /// Seed of speckle and noise.
@@ -61,25 +82,39 @@ pub struct DemoSummary {
 /// The demo's experiment: the template with this seed and move, and optics that are wrong on purpose.
 fn experiment(options: &Options) -> Result<(Experiment, Optics), Error> {
     let mut experiment = Experiment::parse(experiment::template(), Path::new("the built-in template"))?;
-    let truth = optics_section::from_section(&experiment.optics)?;
-    experiment.seed = options.seed;
-    let [x, y, z] = options.move_mm.map(|mm| Some(Length::new(mm)));
-    replace_measured_move(&mut experiment.sequence, MoveStep { x, y, z });
-
+    let section = optics_section::of(&experiment)?;
+    let truth = optics_section::from_section(section)?;
     let mut believed = truth;
     if options.calibrate {
         believed.camera.focal_px *= 1.0 + START_ERROR;
         believed.pinhole_to_grating_mm *= 1.0 - START_ERROR;
         believed.grating_to_reference_mm *= 1.0 + START_ERROR;
     }
-    experiment.optics = optics_section::with_calibrated(&experiment.optics, &believed);
-    if let Some(grating) = &mut experiment.optics.grating {
+    let mut section = optics_section::with_calibrated(section, &believed);
+    if let Some(grating) = &mut section.grating {
         grating.pitch = Some(Length::new(truth.minus.pitch_mm * options.pitch_factor));
         grating.lines = None;
     }
+    experiment.optics = Some(section);
+    command(&mut experiment, options);
     experiment.processing.calibrate = options.calibrate;
     experiment.processing.axis_height = Length::new(simulated::demo_height_mm(0.0, 0.0));
     Ok((experiment, truth))
+}
+
+/// The demo's experiment under the microscope: the template with this seed and move.
+fn microscope_experiment(options: &Options) -> Result<Experiment, Error> {
+    let path = Path::new("the built-in template");
+    let mut experiment = Experiment::parse(experiment::microscope_template(), path)?;
+    command(&mut experiment, options);
+    Ok(experiment)
+}
+
+/// Seed and move as the user wants them.
+fn command(experiment: &mut Experiment, options: &Options) {
+    experiment.seed = options.seed;
+    let [x, y, z] = options.move_mm.map(|mm| Some(Length::new(mm)));
+    replace_measured_move(&mut experiment.sequence, MoveStep { x, y, z });
 }
 
 /// The move before the frame to be measured is the one that the demo is about.
@@ -98,10 +133,20 @@ fn replace_measured_move(sequence: &mut [Step], wanted: MoveStep) {
 /// Whatever keeps the chain from running to its end; a check that fails is no error.
 pub fn run(options: &Options, progress: &dyn Progress) -> Result<DemoSummary, Error> {
     let begin = Instant::now();
-    let (experiment, truth) = experiment(options)?;
-    let config = simulated::configuration(&experiment, &truth, simulated::demo_specimen());
+    let (experiment, config) = match options.scene {
+        Scene::Macro => {
+            let (experiment, truth) = experiment(options)?;
+            let config = simulated::macro_scene(&experiment, &truth, simulated::demo_specimen());
+            (experiment, config)
+        }
+        Scene::Microscope => {
+            let experiment = microscope_experiment(options)?;
+            let config = simulated::microscope(&experiment);
+            (experiment, config)
+        }
+    };
     record(&experiment, config, &options.out, Existing::ReplaceKind(DEMO), progress)?;
-    let mut processed = process::process(&options.out, false, progress)?;
+    let mut processed = process::process(&options.out, false, None, progress)?;
     processed.wall_s = Some(begin.elapsed().as_secs_f64());
     complete(&options.out, &processed)?.ok_or(Error::NoResult { path: options.out.join("dataset.json") })
 }
@@ -122,8 +167,17 @@ pub fn complete(root: &Path, processed: &process::Processed) -> Result<Option<De
     if !is_demo(&dataset) {
         return Ok(None);
     }
-    let profile_rms_um = profile_error_um(&dataset)?;
-    let checks = checks(&processed.summary, profile_rms_um);
+    let path = root.join("experiment.toml");
+    let experiment = Experiment::parse(&dataset.experiment_toml()?, &path)?;
+    let microscope = experiment.microscope.is_some();
+    let height_mm = if microscope { simulated::microscope_height_mm } else { simulated::demo_height_mm };
+    let profile = profile_error_um(&dataset, height_mm)?;
+    // under the microscope heights count from the mean of the surface
+    let profile_rms_um = if microscope { profile.std } else { profile.rms };
+    let mut checks = checks(&processed.summary, profile_rms_um, microscope);
+    if microscope {
+        checks.extend(beta_checks(&processed.summary, &experiment)?);
+    }
     let summary = DemoSummary {
         passed: checks.iter().all(|c| c.passed),
         measurement: processed.summary.clone(),
@@ -147,8 +201,7 @@ pub fn simulate(
     existing: Existing,
     progress: &dyn Progress,
 ) -> Result<FrameCounts, Error> {
-    let truth = optics_section::from_section(&experiment.optics)?;
-    let mut config = simulated::configuration(experiment, &truth, simulated::demo_specimen());
+    let mut config = simulated::configuration(experiment)?;
     if let Some(path) = scene {
         config = SimConfig { seed: experiment.seed, ..simulated::load_scene(path)? };
     }
@@ -197,23 +250,53 @@ fn open(rig: &SimRig, experiment: &Experiment) -> Result<Link, Error> {
     Ok(Link::open(rig.port(), recording::link_options(experiment)).map_err(daic_rig::RigError::from)?)
 }
 
-/// RMS over the field of measured height minus the specimen's formula at the measured place.
-fn profile_error_um(dataset: &Dataset) -> Result<f64, Error> {
+/// Measured height minus the specimen's formula at the measured place, over the field.
+fn profile_error_um(dataset: &Dataset, height_mm: fn(f64, f64) -> f64) -> Result<Spread, Error> {
     let records = dataset.frames()?.records;
     let reference = records.iter().find(|f| f.role == daic_dataset::FrameRole::Reference);
-    let Some(reference) = reference else { return Ok(f64::NAN) };
+    let Some(reference) = reference else { return Ok(crate::measure::spread(std::iter::empty::<f64>())) };
     let path = dataset.frame_results(reference.id).join("points.csv");
     let table = Table::read_csv(&path)?;
     let [x, y, h] = ["x_mm", "y_mm", "h_mm"].map(|name| table.numbers(name, &path));
     let (x, y, h) = (x?, y?, h?);
     let status = table.texts("status", &path)?;
-    let errors = (0..status.len())
-        .filter(|&k| status[k] == "ok")
-        .map(|k| 1e3 * (h[k] - simulated::demo_height_mm(x[k], y[k])));
-    Ok(crate::measure::spread(errors).rms)
+    let errors =
+        (0..status.len()).filter(|&k| status[k] == "ok").map(|k| 1e3 * (h[k] - height_mm(x[k], y[k])));
+    Ok(crate::measure::spread(errors))
 }
 
-fn checks(summary: &Summary, profile_rms_um: f64) -> Vec<Check> {
+/// β₁ and β₂ of the calibration against the derivatives of the simulated geometry.
+fn beta_checks(summary: &Summary, experiment: &Experiment) -> Result<Vec<Check>, Error> {
+    let config = simulated::microscope(experiment);
+    let Some(microscope) = &config.scene.microscope else { return Ok(Vec::new()) };
+    let geometry = microscope.geometry(config.camera.width, config.camera.height);
+    let truth = RayMicroscope::new(&geometry)?.parameters().map(|(parameters, _)| parameters);
+    let Ok(truth) = truth else { return Ok(Vec::new()) };
+    let found = |name: &str| {
+        let of = summary.calibration.as_ref()?.parameters.iter().find(|p| p.name.starts_with(name))?;
+        Some(1e-3 * of.value)
+    };
+    let both = [("beta1", truth.beta1_mm_per_px), ("beta2", truth.beta2_mm_per_px)];
+    Ok(both
+        .into_iter()
+        .map(|(name, truth)| {
+            let relative = found(name).map_or(f64::NAN, |value| value / truth - 1.0);
+            Check {
+                name: format!("{name} of the calibration, relative to the simulated geometry"),
+                found: format!("{:+.3} %", 100.0 * relative),
+                limit: format!("{} %", 100.0 * BETA_LIMIT),
+                passed: relative.abs() <= BETA_LIMIT,
+            }
+        })
+        .collect())
+}
+
+fn checks(summary: &Summary, profile_rms_um: f64, microscope: bool) -> Vec<Check> {
+    let (move_limit_um, profile_limit_um) = if microscope {
+        (MICROSCOPE_MOVE_LIMIT_UM, MICROSCOPE_PROFILE_LIMIT_UM)
+    } else {
+        (MOVE_LIMIT_UM, PROFILE_LIMIT_UM)
+    };
     let frames = &summary.frames;
     let all_paired = frames.paired > 0 && frames.missing + frames.extra + frames.ambiguous == 0;
     let mut checks = vec![
@@ -233,7 +316,7 @@ fn checks(summary: &Summary, profile_rms_um: f64) -> Vec<Check> {
         },
     ];
     let rms = summary.rms_um.unwrap_or([f64::NAN; 3]);
-    for ((axis, value), limit) in ["x", "y", "h"].into_iter().zip(rms).zip(MOVE_LIMIT_UM) {
+    for ((axis, value), limit) in ["x", "y", "h"].into_iter().zip(rms).zip(move_limit_um) {
         checks.push(Check {
             name: format!("move along {axis}, RMS of measured minus commanded"),
             found: format!("{value:.3} µm"),
@@ -244,8 +327,8 @@ fn checks(summary: &Summary, profile_rms_um: f64) -> Vec<Check> {
     checks.push(Check {
         name: "height, RMS of measured minus the specimen's formula".to_owned(),
         found: format!("{profile_rms_um:.3} µm"),
-        limit: format!("{PROFILE_LIMIT_UM} µm"),
-        passed: profile_rms_um <= PROFILE_LIMIT_UM,
+        limit: format!("{profile_limit_um} µm"),
+        passed: profile_rms_um <= profile_limit_um,
     });
     checks
 }

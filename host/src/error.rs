@@ -6,6 +6,33 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
+    /// Live matching of a mosaic sensor.
+    #[error(
+        "live matching takes whole images: take the pixels of one channel out of each frame first (Lattice::of)"
+    )]
+    LiveMosaic,
+    /// An option that the demo's scene does not have.
+    #[error("{reason}")]
+    DemoOption {
+        /// What, and what is allowed.
+        reason: String,
+    },
+    /// An experiment under the microscope, where the macro set-up's optics are wanted.
+    #[error("this experiment describes a microscope: it has no [optics]")]
+    NoOptics,
+    /// The microscope's frames have been measured without a calibration.
+    #[error(
+        "a microscope is calibrated by its own moves: give frames with role = \"calibration\" (a z move and an in-plane move) and processing.calibrate = true"
+    )]
+    NoMoves,
+    /// The moves of a dataset leave parameters of the microscope open.
+    #[error("the calibration frames leave open: {}; add {}", open.join(", "), add.join(" and "))]
+    MovesOpen {
+        /// Parameters that are not determined.
+        open: Vec<&'static str>,
+        /// Motions that would determine them.
+        add: Vec<&'static str>,
+    },
     /// An experiment or optics file.
     #[error(transparent)]
     Config(#[from] daic_rig::experiment::ConfigError),
@@ -70,6 +97,32 @@ pub enum Error {
         /// What it says.
         meaning: &'static str,
     },
+    /// Optics of a grating set-up for a dataset under the microscope.
+    #[error("{} is an optics file, the dataset {} was taken under a microscope and is calibrated by its own moves", optics.display(), root.display())]
+    NotForMicroscope {
+        /// The optics file.
+        optics: PathBuf,
+        /// The dataset.
+        root: PathBuf,
+    },
+    /// Two inputs whose results would have the same name.
+    #[error("{} and {} would both be written as {}; rename one, or give them folders of their own with --out", first.display(), second.display(), file.display())]
+    SameName {
+        /// The first.
+        first: PathBuf,
+        /// The second.
+        second: PathBuf,
+        /// The result.
+        file: PathBuf,
+    },
+    /// A folder in which no image appeared.
+    #[error("{}: no new image came within {seconds} s; let the camera's program write into this folder", folder.display())]
+    NoImageCame {
+        /// The folder.
+        folder: PathBuf,
+        /// How long it was watched.
+        seconds: f64,
+    },
     /// A record of the alignment that cannot be read.
     #[error("{} is no record of an alignment: {reason}", path.display())]
     AlignRecord {
@@ -89,9 +142,98 @@ pub enum Error {
         /// What is wrong, with the parameter's name.
         reason: String,
     },
+    /// A distortion map that the optics file names and that is not the one meant.
+    #[error("{}: maps.{name}: {reason}", path.display())]
+    OpticsMap {
+        /// The optics file.
+        path: PathBuf,
+        /// `sensor`, `minus` or `plus`.
+        name: &'static str,
+        /// What is wrong, and the way out.
+        reason: String,
+    },
+    /// A file of a distortion map that cannot be used.
+    #[error("{} is no usable distortion map: {reason}; write it anew with `daic calibrate distortion`", path.display())]
+    DistortionFile {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, with the field's name.
+        reason: String,
+    },
+    /// The −1 and the +1 view taken for each other.
+    #[error(
+        "the −1 and +1 views are mistaken for each other: the lines of sight of {points} pairs meet on the camera's side of the grating or not at all. The −1 view is the one on the left of the sensor; exchange the pixels of the two views, or turn the images"
+    )]
+    SwappedOrders {
+        /// Pairs of which this is so.
+        points: usize,
+    },
+    /// A step of the grid of object coordinates that gives none, or too large a one.
+    #[error(
+        "no grid of object coordinates: {nodes} nodes at a step of {step_mm} mm; give --object-step between the distance of the points and a hundredth of it"
+    )]
+    ObjectGrid {
+        /// Distance of nodes.
+        step_mm: f64,
+        /// How many there would be.
+        nodes: f64,
+    },
+    /// A map that every result has.
+    #[error("the results hold no map `{name}`")]
+    NoMap {
+        /// Its name.
+        name: &'static str,
+    },
+    /// Strain on the surface.
+    #[error("the strain on the surface cannot be computed: {0}")]
+    SurfaceStrain(#[from] daic_optics::surface::SurfaceError),
     /// The rig could not be calibrated.
-    #[error("no calibration of the rig: {0}")]
-    CalibrateRig(#[from] daic_optics::RigError),
+    #[error("{}: no calibration of the rig: {source}{}", path.display(), own_numbers(*pose, *point))]
+    CalibrateRig {
+        /// The table of points.
+        path: PathBuf,
+        /// Why; its poses and points count from 0 in the order of the table's numbers.
+        source: daic_optics::RigError,
+        /// The table's own number of the pose to blame, if one is.
+        pose: Option<i64>,
+        /// The table's own number of the point.
+        point: Option<i64>,
+    },
+    /// The distortion could not be calibrated.
+    #[error("no calibration of the distortion: {0}")]
+    CalibrateDistortion(#[from] daic_optics::DistortionError),
+    /// An image of a line target without usable phases.
+    #[error("{}: no phases of a line target: {source}", path.display())]
+    TargetPhase {
+        /// The image.
+        path: PathBuf,
+        /// Why.
+        source: daic_correlate::phase::PhaseError,
+    },
+    /// One image, and only one direction of lines in it.
+    #[error(
+        "{} shows lines in one direction only (their normal at {angle_deg:.1}°, {pitch_px:.2} px apart): a single image must be of a cross grating; of lines give two, along x and along y",
+        path.display()
+    )]
+    OneImageOfLines {
+        /// The image.
+        path: PathBuf,
+        /// Distance of the lines.
+        pitch_px: f64,
+        /// Angle of their normal against x.
+        angle_deg: f64,
+    },
+    /// Neither one image nor two.
+    #[error(
+        "{found} images of a target given: give one of a cross grating, or two, of lines along x and of lines along y"
+    )]
+    TargetImages {
+        /// Images given.
+        found: usize,
+    },
+    /// Rays through the grating were asked for without what they need.
+    #[error("--ideal ray traces rays through the grating: it needs --optics FILE and --view minus or plus")]
+    IdealRay,
     /// A row of a table of tracked points or moves that cannot be used.
     #[error("{}, row {row}: {column} is {value}, it must be {allowed}", path.display())]
     TrackedPoint {
@@ -358,6 +500,9 @@ pub enum Error {
     /// The calibration of a microscope.
     #[error("the calibration failed: {0}")]
     CalibrateMicroscope(#[from] daic_optics::microscope::calibrate::CalibrateError),
+    /// A parameter that no microscope has.
+    #[error("microscope: {0}")]
+    Microscope(#[from] daic_optics::microscope::MicroscopeError),
     /// A file of motions or of a microscope.
     #[error(transparent)]
     MicroscopeFile(#[from] crate::microscope::MicroscopeFileError),
@@ -477,5 +622,15 @@ impl Error {
             Self::Config(error) | Self::Rig(daic_rig::RigError::Config(error)) => Some(error),
             _ => None,
         }
+    }
+}
+
+/// How the numbers of a message that counts from 0 read in the user's table.
+fn own_numbers(pose: Option<i64>, point: Option<i64>) -> String {
+    match (pose, point) {
+        (Some(pose), Some(point)) => format!(" (in the table: pose {pose}, point {point})"),
+        (Some(pose), None) => format!(" (in the table: pose {pose})"),
+        (None, Some(point)) => format!(" (in the table: point {point})"),
+        (None, None) => String::new(),
     }
 }

@@ -3,7 +3,7 @@
 use crate::error::Error;
 use crate::measure::Rectangle;
 use daic_dataset::{FloatMap, GreyImage, atomic};
-use daic_report::{ColourScale, Figure, GridAxes, Heatmap, HeightSurface, Mark, Overlay};
+use daic_report::{ColourScale, Figure, GridAxes, Heatmap, HeightSurface, Mark, Markup, Overlay};
 use std::path::Path;
 
 fn axes(map: &FloatMap) -> GridAxes {
@@ -25,6 +25,9 @@ fn heatmap(map: &FloatMap, title: &str, quantity: &str, unit: &str, factor: f64)
         scale,
     }
 }
+
+/// What a map of the gap says.
+pub const GAP_CAPTION: &str = "Distance at which the two rays of a point pass each other, above 0 where the +1 view's passes at larger y. Noise alone is the same everywhere; a slope, a bow or a constant is a calibration that does not fit.";
 
 /// Writes the bare map as a picture, a square per node, transparent where there is no value.
 ///
@@ -67,12 +70,20 @@ pub fn map_figure(
     })
 }
 
+/// A map as it is, with axes and colour bar.
+///
+/// # Errors
+/// If the figure cannot be drawn.
+pub fn map_drawing(map: &FloatMap, title: &str, quantity: &str) -> Result<Markup, Error> {
+    Ok(heatmap(map, title, quantity, &map.unit, 1.0).render_svg()?)
+}
+
 /// A map as it is, with axes and colour bar, as an SVG document.
 ///
 /// # Errors
 /// If the figure cannot be drawn.
 pub fn map_svg(map: &FloatMap, title: &str, quantity: &str) -> Result<String, Error> {
-    Ok(heatmap(map, title, quantity, &map.unit, 1.0).render_svg()?.as_str().to_owned())
+    Ok(map_drawing(map, title, quantity)?.as_str().to_owned())
 }
 
 /// Unit in which a map of millimetres is drawn.

@@ -40,7 +40,8 @@ pub fn expand(given: &[PathBuf], reference: &Path) -> Result<Vec<PathBuf>, Error
     Ok(all)
 }
 
-fn listed(folder: &Path) -> Result<Vec<PathBuf>, Error> {
+/// The images in a folder, in no order.
+pub(crate) fn listed(folder: &Path) -> Result<Vec<PathBuf>, Error> {
     let read = |source| Error::Read { path: folder.to_owned(), source };
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(read)? {

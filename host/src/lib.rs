@@ -11,18 +11,23 @@
 //! * [`pair`]: plain 2D-DIC of two images; [`strain`] and [`probe`] work on its results, [`noise_floor`]
 //!   says what such a measurement can resolve.
 //! * [`phase`]: phases of gratings and displacements from them.
+//! * [`calibrate_distortion`]: images of a line target become a distortion map.
 //! * [`calibrate_rig`]: points tracked on a plate become an optics file.
 //! * [`calibrate_camera`]: a camera from images of a board; [`align`]: lining up a rig.
+//! * [`optics_file`]: an optics file with covariance, distortion maps ([`distortion_file`]) and volume, ready to
+//!   decode; [`pairs`] decodes pixel pairs from elsewhere.
 //! * [`sequence`]: the same of a series of images.
 //! * [`microscope`]: calibration of the microscope from known motions.
 
 pub mod align;
 pub mod area;
 pub mod calibrate_camera;
+pub mod calibrate_distortion;
 pub mod calibrate_rig;
 pub mod camera_file;
 #[cfg(feature = "sim")]
 pub mod demo;
+pub mod distortion_file;
 pub mod doctor;
 pub mod error;
 pub mod expand;
@@ -33,8 +38,10 @@ pub mod images;
 pub mod measure;
 pub mod microscope;
 pub mod noise_floor;
+pub mod optics_file;
 pub mod optics_section;
 pub mod pair;
+pub mod pairs;
 pub mod phase;
 pub mod probe;
 pub mod process;

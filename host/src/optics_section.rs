@@ -9,6 +9,14 @@ use daic_rig::units::{Angle, Length, Pixels};
 use nalgebra::DMatrix;
 use std::path::Path;
 
+/// The `[optics]` of an experiment.
+///
+/// # Errors
+/// [`Error::NoOptics`] for an experiment under the microscope.
+pub fn of(experiment: &experiment::Experiment) -> Result<&experiment::Optics, Error> {
+    experiment.optics.as_ref().ok_or(Error::NoOptics)
+}
+
 /// The optics that a checked section describes.
 ///
 /// # Errors
@@ -109,12 +117,19 @@ pub fn to_section(section: &experiment::Optics, optics: &Optics) -> experiment::
 /// # Errors
 /// [`Error::OpticsCovariance`] if it names unknown parameters or is no covariance.
 pub fn covariance(file: &experiment::OpticsFile, path: &Path) -> Result<Option<ParameterCovariance>, Error> {
-    let Some(c) = &file.covariance else { return Ok(None) };
+    file.covariance.as_ref().map(|c| covariance_of(c, path)).transpose()
+}
+
+/// The covariance that a section states; `path` is only named in errors.
+///
+/// # Errors
+/// As [`covariance`].
+pub fn covariance_of(c: &experiment::Covariance, path: &Path) -> Result<ParameterCovariance, Error> {
     let wrong = |reason: String| Error::OpticsCovariance { path: path.to_owned(), reason };
     let parameters = c.parameters.iter().map(|name| Parameter::from_name(name));
     let parameters = parameters.collect::<Result<Vec<_>, _>>().map_err(|e| wrong(e.to_string()))?;
     let n = parameters.len();
     let value = |i: usize, j: usize| c.matrix.get(i).and_then(|row| row.get(j)).copied().unwrap_or(f64::NAN);
     let matrix = DMatrix::from_fn(n, n, value);
-    ParameterCovariance::new(parameters, matrix).map(Some).map_err(|e| wrong(e.to_string()))
+    ParameterCovariance::new(parameters, matrix).map_err(|e| wrong(e.to_string()))
 }

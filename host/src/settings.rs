@@ -1,11 +1,19 @@
 //! From the `[processing]` section to what the crates want.
 
 use crate::measure;
-use daic_rig::experiment::{self, Processing};
+use daic_dataset::Lattice;
+use daic_rig::experiment::{self, Experiment};
+
+/// The pixels of a channel of a mosaic sensor; without one all.
+pub fn lattice(bayer: Option<experiment::Bayer>) -> Lattice {
+    bayer.map_or(Lattice::ALL, |b| Lattice::bayer(b.origin()))
+}
 
 /// Measurement settings of an experiment.
-pub fn measure_settings(processing: &Processing) -> measure::Settings {
+pub fn measure_settings(experiment: &Experiment) -> measure::Settings {
+    let processing = &experiment.processing;
     measure::Settings {
+        lattice: lattice(experiment.rig.camera.bayer),
         dic: daic_correlate::Settings {
             subset: processing.subset as usize,
             shape: match processing.shape {

@@ -1,13 +1,15 @@
 //! The simulated rig as an experiment describes it, and its camera as the rig crate sees one.
 
 use crate::error::Error;
+use crate::optics_section;
 use daic_hil_sim::config::{
-    AxisConfig, GratingConfig, LedConfig, LightConfig, OpticsConfig, SimConfig, SpecimenConfig, SurfaceConfig,
+    AxisConfig, BayerConfig, BayerPattern, GratingConfig, LedConfig, LightConfig, MicroscopeConfig,
+    OpticsConfig, SimConfig, SpecimenConfig, SurfaceConfig, TextureConfig,
 };
 use daic_hil_sim::frame::SimFrame;
 use daic_optics::{Grating, Optics};
 use daic_rig::camera::{Camera, CameraError, CameraInfo, CameraSettings, CameraStats, Frame, FrameError};
-use daic_rig::experiment::Experiment;
+use daic_rig::experiment::{self, Experiment};
 use daic_rig::units::Time;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
@@ -15,12 +17,69 @@ use std::time::{Duration, Instant};
 /// How full the brightest point makes the well with the experiment's own strobe.
 const FILL: f64 = 0.85;
 
+/// A rig as the experiment describes it: what its `[optics]` says is true and the specimen the demo's, or the
+/// simulated microscope with its specimen.
+///
+/// # Errors
+/// Optics that no set-up can have.
+pub fn configuration(experiment: &Experiment) -> Result<SimConfig, Error> {
+    match &experiment.microscope {
+        Some(_) => Ok(microscope(experiment)),
+        None => {
+            let optics = optics_section::from_section(optics_section::of(experiment)?)?;
+            Ok(macro_scene(experiment, &optics, demo_specimen()))
+        }
+    }
+}
+
 /// A rig as the experiment describes it, in front of `specimen`, with `optics` as its truth.
-pub fn configuration(experiment: &Experiment, optics: &Optics, specimen: SpecimenConfig) -> SimConfig {
-    let mut config = SimConfig { seed: experiment.seed, ..SimConfig::default() };
+pub fn macro_scene(experiment: &Experiment, optics: &Optics, specimen: SpecimenConfig) -> SimConfig {
+    let mut config = SimConfig::default();
     config.scene.optics = truth(optics);
     config.scene.specimen = specimen;
+    with_rig(config, experiment, optics.wavelength_mm)
+}
 
+/// Radius and apex of the specimen under the microscope, millimetres.
+const CAP_MM: [f64; 2] = [2.0, 0.003];
+
+/// The simulated microscope in front of a spherical cap larger than its field, with a camera of 25 000 electrons
+/// and 10 electrons of read noise.
+pub fn microscope(experiment: &Experiment) -> SimConfig {
+    let mut config = SimConfig::default();
+    // four rays per point have the disk's variance, and a frame takes seconds
+    let microscope = MicroscopeConfig { pupil_rings: 1, ..MicroscopeConfig::default() };
+    let wavelength_mm = microscope.wavelength_mm;
+    config.scene.microscope = Some(microscope);
+    config.scene.specimen = SpecimenConfig {
+        surface: SurfaceConfig::Sphere { radius_mm: CAP_MM[0], apex_mm: CAP_MM[1], floor_mm: None },
+        half_width_mm: 0.25,
+        half_height_mm: 0.25,
+        offset_mm: [0.0; 3],
+    };
+    config.scene.texture = TextureConfig { speckle_mm: 0.0027, ..TextureConfig::default() };
+    config.camera.full_well_electrons = 25_000.0;
+    config.camera.read_noise_electrons = 10.0;
+    with_rig(config, experiment, wavelength_mm)
+}
+
+/// Height of the specimen under the microscope at (x, y), all in millimetres, from the formula of the sphere.
+pub fn microscope_height_mm(x: f64, y: f64) -> f64 {
+    (CAP_MM[0].powi(2) - x * x - y * y).sqrt() - CAP_MM[0] + CAP_MM[1]
+}
+
+/// What a red, green and blue pixel of a common sensor make of light of one wavelength, the best of them being 1:
+/// bell curves about 610, 535 and 460 nm over a floor of 2 %.
+fn response(wavelength_mm: f64) -> [f64; 3] {
+    let nm = wavelength_mm * 1e6;
+    let bell = |centre: f64| 0.02 + 0.98 * (-0.5 * ((nm - centre) / 40.0).powi(2)).exp();
+    let all = [610.0, 535.0, 460.0].map(bell);
+    let best = all.iter().copied().fold(0.0, f64::max);
+    all.map(|r| r / best)
+}
+
+fn with_rig(mut config: SimConfig, experiment: &Experiment, wavelength_mm: f64) -> SimConfig {
+    config.seed = experiment.seed;
     let camera = &experiment.rig.camera;
     config.camera.width = camera.width as usize;
     config.camera.height = camera.height as usize;
@@ -29,6 +88,16 @@ pub fn configuration(experiment: &Experiment, optics: &Optics, specimen: Specime
     config.camera.trigger_delay_ns = camera.exposure_delay.ns().round() as u64;
     config.camera.exposure_ns = camera.exposure.ns().round() as u64;
     config.camera.readout_ns = camera.readout.ns().round() as u64;
+    config.camera.row_ns = camera.row_time.ns().round() as u64;
+    config.camera.bayer = camera.bayer.map(|bayer| BayerConfig {
+        pattern: match bayer.pattern {
+            experiment::BayerPattern::Rggb => BayerPattern::Rggb,
+            experiment::BayerPattern::Grbg => BayerPattern::Grbg,
+            experiment::BayerPattern::Gbrg => BayerPattern::Gbrg,
+            experiment::BayerPattern::Bggr => BayerPattern::Bggr,
+        },
+        response: response(wavelength_mm),
+    });
     // the whole range of grey levels, a twentieth of it for the dark level
     let levels = f64::from((1u32 << camera.bits) - 1);
     config.camera.offset_dn = (0.05 * levels).round();

@@ -148,6 +148,108 @@ fn camera_from_images_and_the_distance_of_a_board() {
     assert!(answer["advice"][0].as_str().expect("text").contains("about z by −"), "{answer}");
     let table: toml::Table = std::fs::read_to_string(&record).expect("record").parse().expect("TOML");
     assert!(table.contains_key("distance") && table.contains_key("orders"));
+    the_rest_of_the_alignment(folder.path(), &camera_file, &record, &line);
+}
+
+/// Guide, gratings back on the rail, tilts into the optics file, images as they arrive.
+fn the_rest_of_the_alignment(folder: &Path, camera_file: &Path, record: &Path, line: &[[f64; 2]]) {
+    let on = |words: &[&str]| {
+        let mut arguments = vec!["align"];
+        arguments.extend(words);
+        arguments.extend(["--camera", path(camera_file), "--record", path(record), "--json"]);
+        json(&arguments)
+    };
+    let guide = on(&["guide"]);
+    let states: Vec<&str> = guide["steps"]
+        .as_array()
+        .expect("steps")
+        .iter()
+        .map(|s| s["state"].as_str().expect("state"))
+        .collect();
+    let expected =
+        ["done", "to_do", "to_do", "to_do", "correct", "to_do", "by_hand", "done", "to_do", "done", "to_do"];
+    assert_eq!(states, expected);
+    assert_eq!(guide["next"], 5);
+
+    // the aperture 400 mm from the pinhole, the reflected spot beside it: 2 mrad about y over a way of 300 mm
+    let lit = |x: f64, y: f64| {
+        let data = (0..W * H).map(|k| {
+            let r = ((k % W) as f64 - x).hypot((k / W) as f64 - y);
+            (20.0 + 180.0 / (1.0 + ((r - 12.0) / 0.6).exp())) as f32
+        });
+        Image { width: W, height: H, data: data.collect() }.recorded(2.0, 255.0, 8)
+    };
+    let aperture = save(folder, "aperture.png", &lit(250.0, 180.0));
+    let shift = 600.0 * (2.0 * 2e-3 * 300.0) / 400.0;
+    let reflected = save(folder, "reflected.png", &spots(&[[250.0 + shift, 180.0]]));
+    let way = ["--pinhole-to-aperture", "400", "--grating-to-aperture", "300"];
+    let found = on(&[&["reflection", path(&aperture), path(&reflected)][..], &way[..]].concat());
+    let about_y = found["found"]["tilt_rad"][1]["value"].as_f64().expect("number");
+    assert!((about_y.abs() - 2e-3).abs() < 5e-5, "{about_y}");
+
+    // back on the rail, turned by another 3 mrad, which is told
+    let turned: Vec<[f64; 2]> = line.iter().map(|[x, y]| [*x, y + 3e-3 * (x - 243.0)]).collect();
+    let again = save(folder, "again.png", &spots(&turned));
+    let found = on(&["orders", path(&again), "--again"]);
+    assert_eq!(found["step"], "orders_again");
+    let advice = found["advice"].to_string();
+    assert!(advice.contains("since step orders the gratings have turned about z by +"), "{advice}");
+
+    let image = folder.join("square.png");
+    let example = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/golden-macro.toml");
+    let optics = folder.join("aligned.toml");
+    let board = ["--board", "dots", "--pitch", "6,0.001", "--grating-to-board", "40,0.05"];
+    let files = ["--optics", path(&example), "--out", path(&optics), "--first-grating", "plus"];
+    on(&[&["distance", path(&image)][..], &board[..], &files[..]].concat());
+    let written = daic_rig::experiment::OpticsFile::load(&optics).expect("valid");
+    let covariance = daic::optics_section::covariance(&written, &optics).expect("valid").expect("stated");
+    let sigma = |name: &str| {
+        let k = covariance.parameters().iter().position(|p| p.name() == name).expect(name);
+        covariance.matrix()[(k, k)].sqrt()
+    };
+    assert!((sigma("grating_to_reference_mm") - 0.05).abs() < 1e-9);
+    // d of the caliper, 0.05 mm, and D by F, pose and pitch
+    assert!(sigma("pinhole_to_grating_mm") > 0.05 && sigma("pinhole_to_grating_mm") < 0.07);
+    assert!(sigma("plus.tilt_rad_xyz[1]") > 0.0 && written.date.is_some());
+    let provenance = written.provenance.as_ref().expect("stated");
+    assert!(provenance.contains("orders_again (2") && provenance.contains("reflection (2"), "{provenance}");
+    for grating in written.optics.gratings().expect("both") {
+        assert_eq!(grating.tilt[1].rad(), about_y);
+        assert!((grating.tilt[2].rad() - 8e-3).abs() < 5e-4, "{:?}", grating.tilt);
+    }
+
+    // images as they arrive: off, without a spot, at the principal point
+    let live = folder.join("live");
+    std::fs::create_dir(&live).expect("folder");
+    let watch =
+        ["align", "watch", "laser", path(&live), "--camera", path(camera_file), "--idle", "20", "--json"];
+    let program = Command::new(env!("CARGO_BIN_EXE_daic"))
+        .args(watch)
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .expect("daic starts");
+    let centre = CameraFile::load(camera_file).expect("valid").camera.principal_point_px;
+    let pictures = [spots(&[[300.0, 120.0]]), spots(&[]), spots(&[centre])];
+    for (k, picture) in pictures.iter().enumerate() {
+        // complete under its name, as a camera's program does it
+        let made = save(folder, "made.png", picture);
+        std::fs::rename(made, live.join(format!("{k}.png"))).expect("renamed");
+        std::thread::sleep(std::time::Duration::from_millis(400));
+    }
+    let output = program.wait_with_output().expect("ended");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let answer: Value = serde_json::from_slice(&output.stdout).expect("one JSON object");
+    assert_eq!(answer["aligned"], true);
+    let seen = answer["images"].as_array().expect("images");
+    // on a busy machine older ones are passed over
+    assert!((1..=3).contains(&seen.len()) && seen[seen.len() - 1]["found"] == true, "{seen:?}");
+    let empty = folder.join("empty");
+    std::fs::create_dir(&empty).expect("folder");
+    let none =
+        daic(&["align", "watch", "orders", path(&empty), "--camera", path(camera_file), "--idle", "0.2"]);
+    assert_eq!(none.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&none.stderr).contains("no new image came"));
 }
 
 #[test]

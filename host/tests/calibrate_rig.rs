@@ -136,7 +136,7 @@ fn tables_that_cannot_be_used_are_refused_by_row_and_column() {
     let start = optics_section::from_section(&start().optics).unwrap();
     let truth = truth(&start);
     let swapped = calibrate_rig::run(&options(folder.path(), &table(&truth, true))).unwrap_err();
-    assert!(matches!(swapped, Error::CalibrateRig(RigError::SwappedOrders { .. })));
+    assert!(matches!(swapped, Error::CalibrateRig { source: RigError::SwappedOrders { .. }, .. }));
     let good = table(&truth, false);
     let fails = |text: &str| calibrate_rig::run(&options(folder.path(), text)).unwrap_err().to_string();
     assert!(fails(&good.replacen("10,100,", "10.5,100,", 1)).contains("row 1: pose is 10.5"));

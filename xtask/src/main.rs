@@ -1,4 +1,4 @@
-//! The one entry for people and CI: `cargo xtask test | lint | firmware | hil | figures | bench`.
+//! The one entry for people and CI: `cargo xtask test | lint | firmware | hil | figures | reproduce | bench`.
 //!
 //! Every step runs even when an earlier one failed, and the end names what passed, what failed
 //! and what could not be run on this machine, with the reason.
@@ -14,7 +14,7 @@ use std::process::ExitCode;
 const USAGE: &str = "\
 cargo xtask COMMAND
 
-  test       everything that proves the project: unit, property and whole-chain tests, the
+  test       everything that proves the project: unit, property and whole-chain tests,
              the Pico's image (brings its toolchain into target/) and the cases on it in an emulator
   firmware   the Pico's image as ELF and UF2, in target/firmware/
   hil        [--target inprocess|pty|pico] [--port PORT] [--long] [--filter TEXT]: the same cases on the
@@ -23,6 +23,9 @@ cargo xtask COMMAND
   ci         test, then lint
   datasheet  measures on the emulated Pico and writes the numbers into docs/datasheet.md
   figures    draws the pictures of README and docs anew with the program itself
+  coverage   2 000 simulated calibrations: what the stated uncertainties cover (minutes)
+  reproduce  macro: chapter 2 of the thesis, micro: chapter 3, simulated and measured, into
+             docs/reproduction.md
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders
              guard [--update]: instruction counts against the baseline (or: makes a new one)
@@ -47,6 +50,8 @@ fn main() -> ExitCode {
         ["datasheet"] => hil::datasheet(),
         ["hil", ..] => hil::hil(&words[1..]),
         ["figures"] => steps::figures(),
+        ["coverage"] => steps::coverage(),
+        ["reproduce", chapter @ ("macro" | "micro")] => steps::reproduce(chapter),
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),
         ["bench", "optics"] => steps::bench_optics(),

@@ -73,6 +73,10 @@ fn outcome_of(mut command: Command) -> Outcome {
 pub fn test() -> Report {
     let mut report = Report::default();
     report.step("tests of the workspace", || outcome_of(cargo(&["test", "--workspace", "--locked"])));
+    report.step("the tour of the examples", tour);
+    report.step("distortion map of a simulated target", || {
+        distortion_map(&root().join("target/line-target"), "480x360", Profile::Debug)
+    });
     crate::hil::pico(&mut report, &["--target", "pico"]);
     report.step("instruction counts of the correlation (callgrind)", || crate::bench::guard::guard(false));
     report.step("data of others", || {
@@ -87,6 +91,67 @@ pub fn test() -> Report {
         }
     });
     report
+}
+
+/// Where programs are built.
+#[derive(Clone, Copy)]
+enum Profile {
+    Debug,
+    Release,
+}
+
+/// Builds programs of `daic`, with the features of the whole workspace, so that nothing is built twice; gives their folder.
+fn programs(profile: Profile, names: &[&str]) -> Result<PathBuf, Outcome> {
+    let mut build = cargo(&["build", "--locked", "--workspace"]);
+    let folder = match profile {
+        Profile::Debug => "debug",
+        Profile::Release => {
+            build.arg("--release");
+            "release"
+        }
+    };
+    match outcome_of({
+        build.args(names);
+        build
+    }) {
+        Outcome::Passed => {
+            let target =
+                std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root().join("target"), PathBuf::from);
+            Ok(target.join(folder))
+        }
+        failed => Err(failed),
+    }
+}
+
+/// Commands that plan, calibrate, align and decode, on simulated inputs, and their answers against the truth.
+fn tour() -> Outcome {
+    let built = match programs(Profile::Debug, &["--bin", "daic", "--example", "rehearsal"]) {
+        Ok(built) => built,
+        Err(failed) => return failed,
+    };
+    let mut command = Command::new("bash");
+    command.arg(root().join("examples/tour.sh")).arg(built.join("../tour"));
+    command.env("DAIC", built.join("daic")).env("REHEARSAL", built.join("examples/rehearsal"));
+    outcome_of(command)
+}
+
+/// `daic calibrate distortion` on the images that the example writes; the results are in `folder`/map.
+fn distortion_map(folder: &Path, size: &str, profile: Profile) -> Outcome {
+    let built = match programs(profile, &["--bin", "daic", "--example", "line_target"]) {
+        Ok(built) => built,
+        Err(failed) => return failed,
+    };
+    let mut images = Command::new(built.join("examples/line_target"));
+    images.arg(folder).arg(size);
+    match outcome_of(images) {
+        Outcome::Passed => {}
+        failed => return failed,
+    }
+    let mut calibrate = Command::new(built.join("daic"));
+    calibrate.args(["calibrate", "distortion"]);
+    calibrate.args(["along_x.png", "along_y.png"].map(|name| folder.join(name)));
+    calibrate.arg("--out").arg(folder.join("map"));
+    outcome_of(calibrate)
 }
 
 pub fn lint() -> Report {
@@ -143,6 +208,21 @@ pub fn figures() -> Report {
             Err(error) => Outcome::Failed(error.to_string()),
         }
     });
+    report.step("a distortion map into docs/figures", || {
+        let folder = root().join("target/figures-target");
+        match distortion_map(&folder, "2592x1944", Profile::Release) {
+            Outcome::Passed => {}
+            failed => return failed,
+        }
+        let copy = |name: &str| {
+            let to = root().join(format!("docs/figures/distortion-{name}.svg"));
+            std::fs::copy(folder.join(format!("map/{name}.svg")), to).map(|_| ())
+        };
+        match ["e_x", "e_y", "left_x"].into_iter().try_for_each(copy) {
+            Ok(()) => Outcome::Passed,
+            Err(error) => Outcome::Failed(error.to_string()),
+        }
+    });
     report.step("accuracy of the correlation into docs/figures", || {
         let mut command = cargo(&[
             "run",
@@ -155,6 +235,31 @@ pub fn figures() -> Report {
             "--",
         ]);
         command.arg(root().join("docs/figures"));
+        outcome_of(command)
+    });
+    report
+}
+
+/// The Monte-Carlo of the uncertainties that is too long for every day.
+pub fn coverage() -> Report {
+    let mut report = Report::default();
+    report.step("coverage of the stated uncertainties, 2 000 calibrations", || {
+        let arguments = ["test", "--release", "--locked", "--package", "daic", "--test", "coverage", "--"];
+        let mut command = cargo(&arguments);
+        command.args(["--ignored", "--nocapture"]);
+        outcome_of(command)
+    });
+    report
+}
+
+/// A chapter of the thesis into docs/reproduction.md.
+pub fn reproduce(chapter: &str) -> Report {
+    let mut report = Report::default();
+    report.step(&format!("reproduction of the thesis: {chapter}"), || {
+        let program =
+            ["run", "--release", "--locked", "--package", "daic-tests", "--example", "reproduce", "--"];
+        let mut command = cargo(&program);
+        command.arg(chapter).arg(root().join("docs"));
         outcome_of(command)
     });
     report

@@ -3,7 +3,12 @@
 //! Unknown keys are refused. The defaults are the macro set-up of the published method: 633 nm,
 //! 300 lines/mm, a camera of 2592 × 1944 pixels 307 mm in front of the grating.
 
+mod microscope;
+mod sensor;
 mod validate;
+
+pub use microscope::MicroscopeConfig;
+pub use sensor::{BayerConfig, BayerPattern};
 
 use std::path::PathBuf;
 
@@ -41,6 +46,10 @@ pub struct SimConfig {
 pub struct SceneConfig {
     /// Camera geometry and grating.
     pub optics: OpticsConfig,
+    /// A microscope in place of `optics`.
+    pub microscope: Option<MicroscopeConfig>,
+    /// Width of the light's spectrum.
+    pub spectrum: SpectrumConfig,
     /// Shape and extent of the specimen.
     pub specimen: SpecimenConfig,
     /// Speckle on the specimen.
@@ -57,6 +66,8 @@ impl Default for SceneConfig {
     fn default() -> Self {
         Self {
             optics: OpticsConfig::default(),
+            microscope: None,
+            spectrum: SpectrumConfig::default(),
             specimen: SpecimenConfig::default(),
             texture: TextureConfig::default(),
             samples: 2,
@@ -64,6 +75,29 @@ impl Default for SceneConfig {
             blur_positions_max: 256,
         }
     }
+}
+
+/// The spectrum of the light about the mean wavelength of the optics.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SpectrumConfig {
+    /// Its shape.
+    pub shape: SpectrumShape,
+    /// Full width of the box, full width of the Gaussian at half its height; 0 is one wavelength.
+    pub width_mm: f64,
+    /// Wavelengths that are rendered (1 to 256); 0 takes as many as the smear in pixels asks for.
+    pub samples: usize,
+}
+
+/// Shape of a spectrum.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SpectrumShape {
+    /// Even between two ends: an interference filter.
+    #[default]
+    Box,
+    /// An LED.
+    Gaussian,
 }
 
 /// The true geometry: pinhole camera in front of a transmission grating.
@@ -189,7 +223,7 @@ pub enum SurfaceConfig {
         /// Height of a plane that the cone rises from.
         floor_mm: Option<f64>,
     },
-    /// Two levels with a vertical wall: h = low where X < x, high where X ≥ x.
+    /// Two levels with a vertical wall: h = low where X cos a + Y sin a < x, high beyond.
     Step {
         /// Where the wall stands.
         x_mm: f64,
@@ -197,6 +231,9 @@ pub enum SurfaceConfig {
         low_mm: f64,
         /// Height right of it; may be the lower one.
         high_mm: f64,
+        /// Direction a from X towards Y in which the wall is crossed.
+        #[serde(default)]
+        direction_rad: f64,
     },
     /// h = √(R² − X² − Y²) − R + apex.
     Sphere {
@@ -264,6 +301,10 @@ pub struct CameraConfig {
     pub exposure_ns: u64,
     /// From the end of the exposure until the next trigger is taken.
     pub readout_ns: u64,
+    /// How much later than the row above it a row is exposed; 0 is a global shutter.
+    pub row_ns: u64,
+    /// Colour filters before the pixels; without, all pixels are alike.
+    pub bayer: Option<BayerConfig>,
     /// Bits of a pixel value, 8 to 16.
     pub bits: u8,
     /// Electrons per count.
@@ -291,6 +332,8 @@ impl Default for CameraConfig {
             trigger_delay_ns: 5_000,
             exposure_ns: 1_000_000,
             readout_ns: 10_000_000,
+            row_ns: 0,
+            bayer: None,
             bits: 12,
             electrons_per_dn: 2.5,
             full_well_electrons: 10_000.0,
@@ -435,6 +478,16 @@ pub struct FaultsConfig {
 }
 
 impl SimConfig {
+    /// Size of a pixel on the reference plane; in the macro set-up without the grating's stretch, (s + d)/F: a
+    /// lower bound.
+    pub fn pixel_mm(&self) -> f64 {
+        let optics = &self.scene.optics;
+        match &self.scene.microscope {
+            None => (optics.pinhole_to_grating_mm + optics.grating_to_reference_mm) / optics.focal_px,
+            Some(m) => (m.pixel_mm / (m.objective_magnification * m.relay_magnification)).abs(),
+        }
+    }
+
     /// Reads a configuration; the error names line and key.
     pub fn from_toml(text: &str) -> Result<Self, ConfigError> {
         let config: Self = toml::from_str(text).map_err(|e| ConfigError::Syntax(Box::new(e)))?;

@@ -38,6 +38,19 @@ impl SimConfig {
             )?;
             within("scene.optics.grating.substrate_index", grating.substrate_index, 1.0, 4.0)?;
         }
+        let mean = scene.microscope.as_ref().map_or(optics.wavelength_mm, |m| m.wavelength_mm);
+        // Three full widths of a Gaussian stay above 0.
+        within("scene.spectrum.width_mm", scene.spectrum.width_mm, 0.0, 0.5 * mean)?;
+        within("scene.spectrum.samples", scene.spectrum.samples as f64, 0.0, 256.0)?;
+        if let Some(microscope) = &scene.microscope {
+            microscope.geometry(self.camera.width, self.camera.height).validate()?;
+            for &side in &microscope.field_mm {
+                within("scene.microscope.field_mm", side, 1e-6, 1e4)?;
+            }
+            within("scene.microscope.numerical_aperture", microscope.numerical_aperture, 0.0, 0.9)?;
+            within("scene.microscope.focus_height_mm", microscope.focus_height_mm, -1.0, 1.0)?;
+            within("scene.microscope.pupil_rings", microscope.pupil_rings as f64, 1.0, 8.0)?;
+        }
         let specimen = &scene.specimen;
         within("scene.specimen.half_width_mm", specimen.half_width_mm, 1e-6, 1e4)?;
         within("scene.specimen.half_height_mm", specimen.half_height_mm, 1e-6, 1e4)?;
@@ -73,6 +86,10 @@ impl SimConfig {
         within("camera.exposure_ns", camera.exposure_ns as f64, 8.0, 1e12)?;
         within("camera.trigger_delay_ns", camera.trigger_delay_ns as f64, 0.0, 1e12)?;
         within("camera.readout_ns", camera.readout_ns as f64, 0.0, 1e12)?;
+        within("camera.row_ns", camera.row_ns as f64, 0.0, 1e9)?;
+        for &share in camera.bayer.iter().flat_map(|b| &b.response) {
+            within("camera.bayer.response", share, 0.0, 1.0)?;
+        }
         within("camera.bits", f64::from(camera.bits), 8.0, 16.0)?;
         positive("camera.electrons_per_dn", camera.electrons_per_dn)?;
         positive("camera.full_well_electrons", camera.full_well_electrons)?;
@@ -130,8 +147,9 @@ impl SurfaceConfig {
                 within("surface.slope", *slope, 1e-9, 100.0)?;
                 finite("surface.apex_mm, floor_mm", &[*apex_mm, floor_mm.unwrap_or(0.0)])
             }
-            Self::Step { x_mm, low_mm, high_mm } => {
-                finite("surface.x_mm, low_mm, high_mm", &[*x_mm, *low_mm, *high_mm])
+            Self::Step { x_mm, low_mm, high_mm, direction_rad } => {
+                finite("surface.x_mm, low_mm, high_mm", &[*x_mm, *low_mm, *high_mm])?;
+                within("surface.direction_rad", *direction_rad, -4.0, 4.0)
             }
             Self::HeightMap { pixel_mm, black_mm, white_mm, .. } => {
                 positive("surface.pixel_mm", *pixel_mm)?;

@@ -3,29 +3,11 @@
 use rayon::prelude::*;
 
 use crate::scene::Scene;
-
-/// Nodes and weights of Gauss–Legendre quadrature over one pixel, [−½, ½], weights summing to 1.
-fn quadrature(points: usize) -> &'static [(f64, f64)] {
-    const ONE: [(f64, f64); 1] = [(0.0, 1.0)];
-    const TWO: [(f64, f64); 2] = [(-0.288_675_134_594_812_9, 0.5), (0.288_675_134_594_812_9, 0.5)];
-    const THREE: [(f64, f64); 3] =
-        [(-0.387_298_334_620_741_7, 5.0 / 18.0), (0.0, 8.0 / 18.0), (0.387_298_334_620_741_7, 5.0 / 18.0)];
-    const FOUR: [(f64, f64); 4] = [
-        (-0.430_568_155_797_026_3, 0.173_927_422_568_727),
-        (-0.169_990_521_792_428_1, 0.326_072_577_431_273),
-        (0.169_990_521_792_428_1, 0.326_072_577_431_273),
-        (0.430_568_155_797_026_3, 0.173_927_422_568_727),
-    ];
-    match points {
-        0 | 1 => &ONE,
-        2 => &TWO,
-        3 => &THREE,
-        _ => &FOUR,
-    }
-}
+use crate::scene::surface::Line;
 
 impl Scene {
-    /// Mean reflectance over each pixel with the stage at `stage_mm`, row by row; 0 outside the specimen.
+    /// Mean reflectance over each pixel, the spectrum and the cone of rays with the stage at `stage_mm`, row by
+    /// row; 0 outside the specimen.
     ///
     /// Times the light's photo-electrons per second at reflectance 1 this is the expected rate per
     /// pixel. Rows are rendered in parallel; the result does not depend on the number of threads.
@@ -37,28 +19,56 @@ impl Scene {
     }
 
     fn render_row(&self, y: usize, shift: [f64; 3], row: &mut [f32]) {
-        let nodes = quadrature(self.samples);
-        // A pixel whose centre passes the specimen's box by this much has no part inside; the −1
-        // and +1 stretch of a pixel stays below 2 within any usable order.
-        let margin = 4.0 * self.tracer.pixel_mm();
+        let pixel_mm = self.instrument.pixel_mm();
         for (x, pixel) in row.iter_mut().enumerate() {
             let view = self.view_of_column(x);
             let (x, y) = (x as f64, y as f64);
-            let near = self.line(view, x, y, shift).is_some_and(|line| self.surface.may_hit(&line, margin));
-            if !near {
+            let middle = self.line(view, x, y, self.mean_wavelength_mm, shift);
+            // Where a field stop cuts the pixel, its middle may see nothing and its rim something.
+            let near = |line: Line| self.surface.may_hit(&line, self.reach_mm);
+            if !middle.map_or(self.instrument.has_stop(), near) {
                 continue;
             }
             let mut sum = 0.0;
-            for &(dy, wy) in nodes {
-                for &(dx, wx) in nodes {
-                    let hit =
-                        self.line(view, x + dx, y + dy, shift).and_then(|line| self.surface.first_hit(&line));
-                    if let Some([px, py, _]) = hit {
-                        sum += wx * wy * self.texture.reflectance(px, py);
+            for &(wavelength, weight) in &self.spectrum {
+                for &(dy, wy) in &self.nodes {
+                    for &(dx, wx) in &self.nodes {
+                        let seen = self
+                            .line(view, x + dx, y + dy, wavelength, shift)
+                            .map_or(0.0, |line| self.reflectance(&line, shift, pixel_mm));
+                        sum += weight * wx * wy * seen;
                     }
                 }
             }
             *pixel = sum as f32;
         }
+    }
+
+    /// Mean reflectance that the cone about a chief ray meets; 0 beyond the specimen.
+    #[inline]
+    fn reflectance(&self, chief: &Line, shift: [f64; 3], pixel_mm: f64) -> f64 {
+        let at = |line: &Line| {
+            self.surface.first_hit(line).map_or(0.0, |[x, y, _]| self.texture.reflectance(x, y))
+        };
+        let Some(cone) = &self.cone else { return at(chief) };
+        let focus = cone.focus_mm - shift[2];
+        // So near the sharp plane that the cone is narrower than a twentieth of a pixel, its chief ray does.
+        if let Some([x, y, h]) = self.surface.first_hit(chief)
+            && (h - focus).abs() * cone.widest < 0.05 * pixel_mm
+        {
+            return self.texture.reflectance(x, y);
+        }
+        let [x, y] = chief.at_height(focus);
+        let fall = -chief.direction[2];
+        let lean = [chief.direction[0] / fall, chief.direction[1] / fall];
+        cone.rays
+            .iter()
+            .map(|&([a, b], weight)| {
+                let direction = [lean[0] + a, lean[1] + b, -1.0];
+                // Lines begin in front of the specimen.
+                let origin = [x - direction[0], y - direction[1], focus + 1.0];
+                weight * at(&Line { origin, direction })
+            })
+            .sum()
     }
 }

@@ -32,7 +32,7 @@ enum Shape {
     Plane { height: f64, slope: [f64; 2] },
     Cylinder { radius: f64, apex: f64 },
     Cone { apex: f64, slope: f64 },
-    Step { x: f64, low: f64, high: f64 },
+    Step { x: f64, low: f64, high: f64, across: [f64; 2] },
     Sphere { radius: f64, apex: f64 },
     Map(HeightMap),
 }
@@ -59,8 +59,9 @@ impl Surface {
             SurfaceConfig::Cone { apex_mm, slope, floor_mm } => {
                 (Shape::Cone { apex: *apex_mm, slope: *slope }, *floor_mm)
             }
-            SurfaceConfig::Step { x_mm, low_mm, high_mm } => {
-                (Shape::Step { x: *x_mm, low: *low_mm, high: *high_mm }, None)
+            SurfaceConfig::Step { x_mm, low_mm, high_mm, direction_rad } => {
+                let across = [direction_rad.cos(), direction_rad.sin()];
+                (Shape::Step { x: *x_mm, low: *low_mm, high: *high_mm, across }, None)
             }
             SurfaceConfig::Sphere { radius_mm, apex_mm, floor_mm } => {
                 (Shape::Sphere { radius: *radius_mm, apex: *apex_mm }, *floor_mm)
@@ -86,7 +87,9 @@ impl Surface {
             Shape::Plane { height, slope } => Some(height + slope[0] * x + slope[1] * y),
             Shape::Cylinder { radius, apex } => cap(*radius, x * x).map(|h| h + apex),
             Shape::Cone { apex, slope } => Some(apex - slope * x.hypot(y)),
-            Shape::Step { x: wall, low, high } => Some(if x < *wall { *low } else { *high }),
+            Shape::Step { x: wall, low, high, across } => {
+                Some(if x * across[0] + y * across[1] < *wall { *low } else { *high })
+            }
             Shape::Sphere { radius, apex } => cap(*radius, x * x + y * y).map(|h| h + apex),
             Shape::Map(map) => Some(map.height(x, y)),
         };
@@ -109,7 +112,7 @@ impl Surface {
             Shape::Cylinder { radius, apex } => round(line, [1.0, 0.0, 1.0], apex - radius, *radius),
             Shape::Sphere { radius, apex } => round(line, [1.0; 3], apex - radius, *radius),
             Shape::Cone { apex, slope } => cone(line, *apex, *slope),
-            Shape::Step { x, low, high } => step(line, *x, *low, *high),
+            Shape::Step { x, low, high, across } => step(line, *x, *low, *high, *across),
             Shape::Map(map) => map.first_hit(line),
         };
         let hit = match (shape, self.floor) {
@@ -210,20 +213,21 @@ fn cone(line: &Line, apex: f64, slope: f64) -> Option<[f64; 3]> {
 }
 
 #[inline]
-fn step(line: &Line, wall: f64, low: f64, high: f64) -> Option<[f64; 3]> {
+fn step(line: &Line, wall: f64, low: f64, high: f64, across: [f64; 2]) -> Option<[f64; 3]> {
+    let place = |x: f64, y: f64| x * across[0] + y * across[1];
     // Upper level first: on its own side the line ends there.
     let (upper, lower) = (low.max(high), low.min(high));
     let upper_is_right = high >= low;
     let [x, y] = line.at_height(upper);
-    if (x >= wall) == upper_is_right || upper == lower {
+    if (place(x, y) >= wall) == upper_is_right || upper == lower {
         return Some([x, y, upper]);
     }
     let [x, y] = line.at_height(lower);
-    if (x >= wall) != upper_is_right {
+    if (place(x, y) >= wall) != upper_is_right {
         return Some([x, y, lower]);
     }
     // It passes the wall in between.
-    let t = (wall - line.origin[0]) / line.direction[0];
-    let [_, y, h] = line.at(t);
-    Some([wall, y, h])
+    let [origin, direction] = [line.origin, line.direction];
+    let t = (wall - place(origin[0], origin[1])) / place(direction[0], direction[1]);
+    Some(line.at(t))
 }

@@ -18,7 +18,7 @@ pub enum View {
 }
 
 impl View {
-    const fn order(self) -> f64 {
+    pub(super) const fn order(self) -> f64 {
         match self {
             Self::Minus => 1.0,
             Self::Plus => -1.0,
@@ -66,7 +66,6 @@ pub struct Tracer {
     k: [f64; 3],
     p: [f64; 2],
     distorted: bool,
-    wavelength: f64,
     pinhole_to_grating: f64,
     reference: f64,
     plates: [Plate; 2],
@@ -82,7 +81,6 @@ impl Tracer {
             k: config.brown_k,
             p: config.brown_p,
             distorted: config.brown_k != [0.0; 3] || config.brown_p != [0.0; 2],
-            wavelength: config.wavelength_mm,
             pinhole_to_grating: config.pinhole_to_grating_mm,
             reference: config.pinhole_to_grating_mm + config.grating_to_reference_mm,
             plates: [
@@ -97,10 +95,10 @@ impl Tracer {
         self.reference / self.focal_px
     }
 
-    /// The line behind the grating that the pixel position (`x_px`, `y_px`) looks along; `None` if the
-    /// ray misses the grating's front or the order does not propagate.
+    /// The line behind the grating that the pixel position (`x_px`, `y_px`) looks along in light of
+    /// `wavelength_mm`; `None` if the ray misses the grating's front or the order does not propagate.
     #[inline]
-    pub fn line(&self, view: View, x_px: f64, y_px: f64) -> Option<ObjectLine> {
+    pub fn line(&self, view: View, x_px: f64, y_px: f64, wavelength_mm: f64) -> Option<ObjectLine> {
         let observed =
             [(x_px - self.principal[0]) / self.focal_px, (y_px - self.principal[1]) / self.focal_px];
         let [x, y] = if self.distorted { self.undistort(observed) } else { observed };
@@ -115,7 +113,7 @@ impl Tracer {
             return None;
         }
         let walk = n[2] * self.pinhole_to_grating / towards;
-        let out = plate.frame.diffract(Vector3::from(k), view.order(), self.wavelength).ok()?;
+        let out = plate.frame.diffract(Vector3::from(k), view.order(), wavelength_mm).ok()?;
         let mut at = [walk * k[0], walk * k[1], walk * k[2]];
         if plate.thickness > 0.0 {
             // In the glass the component along the faces is that in air over the index; the faces

@@ -10,12 +10,31 @@ use crate::config::CameraConfig;
 use crate::world::ticks_from_ns;
 
 /// Light received while the specimen stood (nearly) still.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct SubPosition {
     /// Position of the stage, averaged over the light, in millimetres.
     pub stage_mm: [f64; 3],
-    /// Photo-electrons at reflectance 1.
+    /// Photo-electrons at reflectance 1 while any row was exposed.
     pub electrons: f64,
+    /// When they came.
+    pieces: Vec<Piece>,
+}
+
+/// Even light from one tick to another.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Piece {
+    from: u64,
+    to: u64,
+    /// Electrons per second at reflectance 1.
+    rate: f64,
+}
+
+impl Piece {
+    /// Electrons between two ticks.
+    fn electrons(&self, from: u64, to: u64) -> f64 {
+        let ticks = self.to.min(to).saturating_sub(self.from.max(from));
+        self.rate * ticks as f64 / f64::from(TICK_HZ)
+    }
 }
 
 /// Light of one exposure, split where the specimen moved.
@@ -26,12 +45,13 @@ pub struct Light {
     most: usize,
 }
 
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 struct Group {
     first_mm: [f64; 3],
     moment: [f64; 3],
     electrons: f64,
     moved: bool,
+    pieces: Vec<Piece>,
 }
 
 impl Light {
@@ -39,13 +59,14 @@ impl Light {
         Self { positions: Vec::new(), step_mm, most: most.max(1) }
     }
 
-    /// Adds `electrons` received at `stage_mm`.
-    fn add(&mut self, stage_mm: [f64; 3], electrons: f64) {
+    /// Adds what was received at `stage_mm`.
+    fn add(&mut self, stage_mm: [f64; 3], piece: Piece) {
+        let electrons = piece.electrons(piece.from, piece.to);
         if electrons <= 0.0 {
             return;
         }
-        let group =
-            Group { first_mm: stage_mm, moment: stage_mm.map(|p| p * electrons), electrons, moved: false };
+        let moment = stage_mm.map(|p| p * electrons);
+        let group = Group { first_mm: stage_mm, moment, electrons, moved: false, pieces: vec![piece] };
         self.push(group);
         while self.positions.len() > self.most {
             // Too long a smear: coarser positions, so that a frame stays affordable.
@@ -65,6 +86,12 @@ impl Light {
                 for k in 0..3 {
                     last.moment[k] += group.moment[k];
                 }
+                for piece in group.pieces {
+                    match last.pieces.last_mut() {
+                        Some(end) if end.to == piece.from && end.rate == piece.rate => end.to = piece.to,
+                        _ => last.pieces.push(piece),
+                    }
+                }
                 return;
             }
         }
@@ -76,7 +103,11 @@ impl Light {
         let position = |g: &Group| {
             // At rest it is exactly where it was, without the rounding of a mean.
             let mean = g.moment.map(|m| m / g.electrons);
-            SubPosition { stage_mm: if g.moved { mean } else { g.first_mm }, electrons: g.electrons }
+            SubPosition {
+                stage_mm: if g.moved { mean } else { g.first_mm },
+                electrons: g.electrons,
+                pieces: g.pieces.clone(),
+            }
         };
         self.positions.iter().map(position).collect()
     }
@@ -94,12 +125,26 @@ pub struct ExposureRecord {
     pub id: u64,
     /// Tick of the trigger's rising edge.
     pub trigger_tick: u64,
-    /// First tick of the exposure.
+    /// First tick of the exposure of row 0.
     pub start_tick: u64,
     /// Tick at which it ended.
     pub end_tick: u64,
-    /// What shone meanwhile.
+    /// How much later each row is than the one above; 0 is a global shutter.
+    pub row_ticks: u64,
+    /// What shone while any row was exposed.
     pub light: Light,
+}
+
+impl ExposureRecord {
+    /// Photo-electrons at reflectance 1 that `row` received while the specimen stood at `position`.
+    pub fn electrons_of_row(&self, position: &SubPosition, row: usize) -> f64 {
+        if self.row_ticks == 0 {
+            return position.electrons;
+        }
+        let late = self.row_ticks.saturating_mul(row as u64);
+        let (from, to) = (self.start_tick.saturating_add(late), self.end_tick.saturating_add(late));
+        position.pieces.iter().map(|piece| piece.electrons(from, to)).sum()
+    }
 }
 
 /// Trigger input and exposure control of the camera.
@@ -109,6 +154,8 @@ pub struct Camera {
     delay: u64,
     exposure: u64,
     readout: u64,
+    row: u64,
+    rows: u64,
     blur_step_mm: f64,
     blur_positions: usize,
     open: Option<ExposureRecord>,
@@ -126,6 +173,8 @@ impl Camera {
             delay: ticks_from_ns(config.trigger_delay_ns),
             exposure: ticks_from_ns(config.exposure_ns).max(1),
             readout: ticks_from_ns(config.readout_ns),
+            row: ticks_from_ns(config.row_ns),
+            rows: config.height as u64,
             blur_step_mm,
             blur_positions,
             open: None,
@@ -162,25 +211,33 @@ impl Camera {
         }
         let start_tick = tick.saturating_add(self.delay);
         let end_tick = start_tick.saturating_add(self.exposure);
-        self.busy_until = end_tick.saturating_add(self.readout);
+        self.busy_until = end_tick.saturating_add(self.rolling()).saturating_add(self.readout);
         self.open = Some(ExposureRecord {
             id: self.next_id,
             trigger_tick: tick,
             start_tick,
             end_tick,
+            row_ticks: self.row,
             light: Light::new(self.blur_step_mm, self.blur_positions),
         });
         self.next_id += 1;
     }
 
+    /// How much later the last row is exposed than the first.
+    fn rolling(&self) -> u64 {
+        self.row.saturating_mul(self.rows.saturating_sub(1))
+    }
+
     /// From tick `from` to tick `to` light of `rate` electrons per second shone on a specimen at `stage_mm`.
     pub fn collect(&mut self, from: u64, to: u64, rate: f64, stage_mm: [f64; 3]) {
+        let rolling = self.rolling();
         let Some(open) = &mut self.open else { return };
-        let (start, end) = (from.max(open.start_tick), to.min(open.end_tick));
+        let last_tick = open.end_tick.saturating_add(rolling);
+        let (start, end) = (from.max(open.start_tick), to.min(last_tick));
         if end > start {
-            open.light.add(stage_mm, rate * (end - start) as f64 / f64::from(TICK_HZ));
+            open.light.add(stage_mm, Piece { from: start, to: end, rate });
         }
-        if to >= open.end_tick {
+        if to >= last_tick {
             self.finished.extend(self.open.take());
         }
     }

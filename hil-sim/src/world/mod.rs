@@ -38,9 +38,6 @@ pub struct World {
 impl World {
     /// Everything at rest at tick 0, all lines low.
     pub fn new(config: &SimConfig) -> Self {
-        let pixel_mm = (config.scene.optics.pinhole_to_grating_mm
-            + config.scene.optics.grating_to_reference_mm)
-            / config.scene.optics.focal_px;
         Self {
             tick: 0,
             word: daic_protocol::channels::SAFE_WORD,
@@ -48,7 +45,7 @@ impl World {
             lamps: Lamps::new(&config.light),
             camera: Camera::new(
                 &config.camera,
-                config.scene.blur_step_px * pixel_mm,
+                config.scene.blur_step_px * config.pixel_mm(),
                 config.scene.blur_positions_max,
             ),
         }

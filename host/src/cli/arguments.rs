@@ -38,6 +38,8 @@ pub enum Command {
     Process(ProcessArgs),
     /// Correlate two images or a series (2D-DIC); takes up a series that was interrupted
     Correlate(CorrelateArgs),
+    /// Points from pixel pairs that were matched elsewhere
+    Decode(DecodeArgs),
     /// Strain from the points of `daic correlate`
     Strain(StrainArgs),
     /// Values at points and along lines, virtual extensometers, from the points of `daic correlate`
@@ -50,6 +52,8 @@ pub enum Command {
     Profile(ProfileArgs),
     /// 3D displacement from one frame with both views to another
     Displacement(DisplacementArgs),
+    /// Follow the points of a frame in both first-order views; makes the fields of `daic calibrate microscope`
+    Track(TrackArgs),
     /// Calibrate an instrument from measurements of something known
     Calibrate(CalibrateArgs),
     /// What a set-up will be able to measure: field, overlaps, uncertainty, light, and what to change
@@ -64,17 +68,30 @@ pub enum Command {
     Doctor(DoctorArgs),
 }
 
+/// What the demo simulates.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum SceneArg {
+    /// One camera behind a grating, 20 mm of field
+    Macro,
+    /// The microscope with a grating, 0.3 mm of field
+    Microscope,
+}
+
 #[derive(Debug, Args)]
 pub struct DemoArgs {
+    /// What is simulated
+    #[arg(long, default_value = "macro")]
+    pub scene: SceneArg,
     /// Folder for the dataset and the report
     #[arg(long, value_name = "DIR", default_value = "demo")]
     pub out: PathBuf,
     /// Seed of speckle and noise
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Stage move in mm: right, down, towards the camera
-    #[arg(long, value_name = "X,Y,Z", default_value = "0.050,-0.030,0.200", value_parser = parse_move, allow_hyphen_values = true)]
-    pub r#move: Move,
+    /// Stage move in mm: right, down, towards the camera (default: 0.050,-0.030,0.200; under the microscope
+    /// 0.004,-0.003,0.006)
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_move, allow_hyphen_values = true)]
+    pub r#move: Option<Move>,
     /// Pitch that the host believes, relative to the rig's true one (for trying out what a wrong one does)
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
     pub pitch_factor: f64,
@@ -124,6 +141,10 @@ pub struct RunArgs {
 pub struct ProcessArgs {
     /// Dataset folder
     pub dataset: PathBuf,
+    /// Decode with this optics file, with its covariance, distortion maps and volume, instead of calibrating by the
+    /// dataset's own moves
+    #[arg(long, value_name = "FILE")]
+    pub optics: Option<PathBuf>,
     /// Measure anew what has been measured already
     #[arg(long)]
     pub fresh: bool,
@@ -214,6 +235,17 @@ pub enum WindowArg {
     GaussianFlat,
     /// Product of two triangles
     BiTriangular,
+}
+
+impl WindowArg {
+    pub fn kind(self) -> daic_correlate::phase::WindowKind {
+        use daic_correlate::phase::WindowKind;
+        match self {
+            Self::Gaussian => WindowKind::Gaussian,
+            Self::GaussianFlat => WindowKind::GaussianFlat,
+            Self::BiTriangular => WindowKind::BiTriangular,
+        }
+    }
 }
 
 /// Which pixels are used.
@@ -342,8 +374,26 @@ pub enum DecoderArg {
 }
 
 #[derive(Debug, Args)]
+pub struct DecodeArgs {
+    /// Optics file (examples/golden-macro.toml), or a microscope's (of `daic calibrate microscope`)
+    #[arg(long, value_name = "FILE")]
+    pub optics: PathBuf,
+    /// Table (CSV) of pixel pairs: minus_x, minus_y, plus_x, plus_y and perhaps sigma_px
+    pub pairs: PathBuf,
+    /// How pixel pairs become points
+    #[arg(long, default_value = "ray")]
+    pub decoder: DecoderArg,
+    /// Standard deviation of a pixel coordinate where the table states none
+    #[arg(long, value_name = "PX", default_value_t = 0.01, value_parser = positive)]
+    pub sigma: f64,
+    /// Points to this file (.csv or .npz)
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
+}
+
+#[derive(Debug, Args)]
 pub struct ProfileArgs {
-    /// Optics file (examples/golden-macro.toml)
+    /// Optics file (examples/golden-macro.toml), or a microscope's (of `daic calibrate microscope`)
     #[arg(long, value_name = "FILE")]
     pub optics: PathBuf,
     /// Frame with both first-order views
@@ -351,8 +401,17 @@ pub struct ProfileArgs {
     /// How pixel pairs become points
     #[arg(long, default_value = "ray")]
     pub decoder: DecoderArg,
+    /// Frames of a colour sensor as it recorded them: pattern and channel that is used, such as rggb:r
+    #[arg(long, value_name = "PATTERN:CHANNEL")]
+    pub bayer: Option<daic_rig::experiment::Bayer>,
+    /// Under a microscope: how far the matches between the views may lie from where the views' outlines coincide, pixels
+    #[arg(long, value_name = "PX", default_value_t = 40.0, value_parser = positive)]
+    pub search: f64,
     #[command(flatten)]
     pub dic: DicArgs,
+    /// Distance of the nodes in object coordinates (default: as far as the points are)
+    #[arg(long, value_name = "MM", value_parser = positive)]
+    pub object_step: Option<f64>,
     /// Folder for points, maps and the report
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
@@ -360,7 +419,7 @@ pub struct ProfileArgs {
 
 #[derive(Debug, Args)]
 pub struct DisplacementArgs {
-    /// Optics file (examples/golden-macro.toml)
+    /// Optics file (examples/golden-macro.toml), or a microscope's (of `daic calibrate microscope`)
     #[arg(long, value_name = "FILE")]
     pub optics: PathBuf,
     /// Reference frame with both first-order views
@@ -370,15 +429,60 @@ pub struct DisplacementArgs {
     /// How pixel pairs become points
     #[arg(long, default_value = "ray")]
     pub decoder: DecoderArg,
+    /// Frames of a colour sensor as it recorded them: pattern and channel that is used, such as rggb:r
+    #[arg(long, value_name = "PATTERN:CHANNEL")]
+    pub bayer: Option<daic_rig::experiment::Bayer>,
+    /// Under a microscope: how far the matches between the views may lie from where the views' outlines coincide, pixels
+    #[arg(long, value_name = "PX", default_value_t = 40.0, value_parser = positive)]
+    pub search: f64,
     #[command(flatten)]
     pub dic: DicArgs,
+    /// Distance of the nodes in object coordinates (default: as far as the points are)
+    #[arg(long, value_name = "MM", value_parser = positive)]
+    pub object_step: Option<f64>,
+    /// Strain on the measured surface as well: Green–Lagrange in the local tangent plane
+    #[arg(long)]
+    pub surface_strain: bool,
+    /// Points along the side of the strain window, odd
+    #[arg(long, value_name = "POINTS", default_value_t = 11, requires = "surface_strain")]
+    pub strain_window: u16,
     /// Folder for points, maps and the report
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
 }
 
 #[derive(Debug, Args)]
+pub struct TrackArgs {
+    /// Reference frame with both first-order views
+    pub reference: PathBuf,
+    /// Frames with the specimen elsewhere
+    #[arg(required = true)]
+    pub frames: Vec<PathBuf>,
+    /// How far the matches between the views may lie from where the views' outlines coincide, pixels
+    #[arg(long, value_name = "PX", default_value_t = 40.0, value_parser = positive)]
+    pub search: f64,
+    /// Where points may lie in the -1 view: X,Y,WIDTH,HEIGHT in pixels (default: the view found)
+    #[arg(long, value_name = "X,Y,W,H", value_parser = parse_roi)]
+    pub roi: Option<Roi>,
+    /// Frames of a colour sensor as it recorded them: pattern and channel that is used, such as rggb:r
+    #[arg(long, value_name = "PATTERN:CHANNEL")]
+    pub bayer: Option<daic_rig::experiment::Bayer>,
+    #[command(flatten)]
+    pub dic: DicArgs,
+    /// Also write the table (CSV) that `daic calibrate rig` takes: the frames show a flat speckled plate, pose 0 is the
+    /// reference, pose 1 the first frame
+    #[arg(long, value_name = "FILE")]
+    pub plate: Option<PathBuf>,
+    /// Folder for the fields, a CSV file per frame
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+}
+
+#[derive(Debug, Args)]
 pub struct InitArgs {
+    /// An experiment under the microscope
+    #[arg(long)]
+    pub microscope: bool,
     /// File to write
     #[arg(default_value = "experiment.toml")]
     pub file: PathBuf,
@@ -423,15 +527,40 @@ pub fn numbers<T: std::str::FromStr, const N: usize>(text: &str, form: &str) -> 
 
 fn parse_move(text: &str) -> Result<Move, String> {
     let values = numbers::<f64, 3>(text, "X,Y,Z in mm, for example 0.050,-0.030,0.200")?;
-    // the demo's scene keeps both views on the sensor and the specimen in range within these
-    const LIMIT_MM: [f64; 3] = [0.5, 0.5, 2.0];
-    for ((value, limit), axis) in values.iter().zip(LIMIT_MM).zip(["X", "Y", "Z"]) {
+    within(values, SceneArg::Macro)?;
+    Ok(Move(values))
+}
+
+/// Refuses moves that take the specimen out of the demo's scene.
+fn within(values: [f64; 3], scene: SceneArg) -> Result<(), String> {
+    // both views stay on the sensor and the specimen in range within these
+    let limits_mm = match scene {
+        SceneArg::Macro => [0.5, 0.5, 2.0],
+        SceneArg::Microscope => [0.012, 0.012, 0.015],
+    };
+    for ((value, limit), axis) in values.iter().zip(limits_mm).zip(["X", "Y", "Z"]) {
         // not-a-number is refused too
         if value.is_nan() || value.abs() > limit {
             return Err(format!("{axis} is {value} mm; allowed are -{limit} to {limit} mm"));
         }
     }
-    Ok(Move(values))
+    Ok(())
+}
+
+impl DemoArgs {
+    /// The move, within the limits of the scene.
+    pub fn move_mm(&self) -> Result<[f64; 3], String> {
+        let default = match self.scene {
+            SceneArg::Macro => [0.050, -0.030, 0.200],
+            SceneArg::Microscope => [0.004, -0.003, 0.006],
+        };
+        if matches!(self.scene, SceneArg::Microscope) && (self.no_calibration || self.pitch_factor != 1.0) {
+            return Err("--no-calibration and --pitch-factor belong to --scene macro: the microscope has nothing to go by but its own moves".to_owned());
+        }
+        let values = self.r#move.map_or(default, |m| m.0);
+        within(values, self.scene)?;
+        Ok(values)
+    }
 }
 
 pub fn parse_roi(text: &str) -> Result<Roi, String> {

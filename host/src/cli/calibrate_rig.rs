@@ -16,7 +16,8 @@ pub struct RigArgs {
     /// Table (CSV) of tracked points: pose, point, plate_x_mm, plate_y_mm, minus_x, minus_y, plus_x, plus_y and
     /// perhaps sigma_px; cells may be empty
     points: PathBuf,
-    /// Table (CSV) of known moves against the reference pose: pose, x_mm, y_mm, h_mm; cells may be empty
+    /// Table (CSV) of known moves against the reference pose: pose, x_mm, y_mm, h_mm and perhaps rx_deg, ry_deg, rz_deg,
+    /// sigma_deg; cells may be empty
     #[arg(long, value_name = "FILE")]
     moves: Option<PathBuf>,
     /// Standard deviation of a known move
@@ -56,6 +57,12 @@ pub fn calibrate(arguments: &RigArgs) -> Result<Answer, Error> {
     .ok();
     for combination in &summary.left_to_priors {
         writeln!(text, "left to priors: {combination}").ok();
+    }
+    if let Some([scale, sigma]) = summary.plate_scale {
+        writeln!(text, "size of the plate by the moves over its stated size: {scale:.6} ± {sigma:.6}").ok();
+    }
+    if let Some([x, y, z]) = summary.stage_axes_mrad {
+        writeln!(text, "axes of the stage turned against the plate by {x:.3}, {y:.3}, {z:.3} mrad").ok();
     }
     for l in &summary.left_out {
         writeln!(

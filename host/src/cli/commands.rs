@@ -1,34 +1,36 @@
 //! What each command does: arguments to facade calls, results to an answer.
 
 use super::arguments::{
-    AreaArgs, CorrelateArgs, CriterionArg, DecoderArg, DicArgs, DisplacementArgs, DoctorArgs, GratingsArg,
-    GuessArg, InitArgs, InterpolationArg, PhaseArgs, ProcessArgs, ProfileArgs, Roi, RunArgs, ShapeArg,
-    SolverArg, UpdateArg, WindowArg,
+    AreaArgs, CorrelateArgs, CriterionArg, DicArgs, DoctorArgs, GratingsArg, GuessArg, InitArgs,
+    InterpolationArg, PhaseArgs, ProcessArgs, Roi, RunArgs, ShapeArg, SolverArg, UpdateArg,
 };
 #[cfg(feature = "sim")]
-use super::arguments::{DemoArgs, SimulateArgs};
+use super::arguments::{DemoArgs, SceneArg, SimulateArgs};
 use super::output::{Answer, Output};
 use daic::area::{self, Area};
-use daic::measure::{self, Rectangle, Reference};
+use daic::measure::{self, Rectangle};
 use daic::sequence::{self, Description};
 use daic::{
-    Error, Progress as _, doctor as checks, frames, images, optics_section, pair, phase as gratings,
-    process as processing, reports,
+    Error, Progress as _, doctor as checks, frames, images, pair, phase as gratings, process as processing,
 };
 use daic_correlate::{Guess, StartReport, StartWarning};
 use daic_dataset::{Existing, GreyImage, atomic};
-use daic_optics::{Decoder, OpticalModel};
-use daic_rig::experiment::{self, Experiment, OpticsFile};
+use daic_rig::experiment::{self, Experiment};
 use serde_json::json;
 use std::fmt::Write as _;
 use std::path::Path;
 
 #[cfg(feature = "sim")]
 pub fn demo(arguments: &DemoArgs, output: &Output) -> Result<Answer, Error> {
+    let scene = match arguments.scene {
+        SceneArg::Macro => daic::demo::Scene::Macro,
+        SceneArg::Microscope => daic::demo::Scene::Microscope,
+    };
     let options = daic::demo::Options {
+        scene,
         out: arguments.out.clone(),
         seed: arguments.seed,
-        move_mm: arguments.r#move.0,
+        move_mm: arguments.move_mm().map_err(|reason| Error::DemoOption { reason })?,
         pitch_factor: arguments.pitch_factor,
         calibrate: !arguments.no_calibration,
     };
@@ -98,7 +100,8 @@ fn recording_answer(out: &Path, recorded: &processing::FrameCounts) -> Result<An
 }
 
 pub fn process(arguments: &ProcessArgs, output: &Output) -> Result<Answer, Error> {
-    let processed = processing::process(&arguments.dataset, arguments.fresh, output)?;
+    let optics = arguments.optics.as_deref().map(daic::optics_file::CalibratedOptics::load).transpose()?;
+    let processed = processing::process(&arguments.dataset, arguments.fresh, optics.as_ref(), output)?;
     let mut text = String::new();
     for note in processed.summary.damage.iter().chain(processed.summary.failed.iter().map(|f| &f.reason)) {
         writeln!(text, "note: {note}").ok();
@@ -272,13 +275,9 @@ fn correlate_sequence(arguments: &CorrelateArgs, output: &Output) -> Result<Answ
 }
 
 pub fn phase(arguments: &PhaseArgs, output: &Output) -> Result<Answer, Error> {
-    use daic_correlate::phase::{Gratings, PhaseSettings, WindowKind};
+    use daic_correlate::phase::{Gratings, PhaseSettings};
     let settings = PhaseSettings {
-        window: match arguments.window {
-            WindowArg::Gaussian => WindowKind::Gaussian,
-            WindowArg::GaussianFlat => WindowKind::GaussianFlat,
-            WindowArg::BiTriangular => WindowKind::BiTriangular,
-        },
+        window: arguments.window.kind(),
         width: arguments.width,
         gratings: match arguments.gratings {
             GratingsArg::Auto => Gratings::Auto,
@@ -430,84 +429,8 @@ pub fn shape(shape: ShapeArg) -> daic_correlate::Shape {
     }
 }
 
-fn decoder(decoder: DecoderArg) -> Decoder {
-    match decoder {
-        DecoderArg::Ray => Decoder::Ray,
-        DecoderArg::Closed => Decoder::Closed,
-        DecoderArg::Linear => Decoder::Linear,
-    }
-}
-
-fn measure_settings(arguments: &DicArgs) -> measure::Settings {
-    let mut settings = measure::Settings::default();
-    apply(arguments, &mut settings.dic, &mut settings.step);
-    settings
-}
-
-fn model(path: &Path) -> Result<OpticalModel, Error> {
-    Ok(OpticalModel::new(&optics_section::from_section(&OpticsFile::load(path)?.optics)?)?)
-}
-
-fn make_folder(path: &Path) -> Result<(), Error> {
+pub fn make_folder(path: &Path) -> Result<(), Error> {
     std::fs::create_dir_all(path).map_err(|source| Error::Folder { path: path.to_owned(), source })
-}
-
-pub fn profile(arguments: &ProfileArgs, output: &Output) -> Result<Answer, Error> {
-    let model = model(&arguments.optics)?;
-    let frame = images::read(&arguments.frame)?;
-    let settings = measure_settings(&arguments.dic);
-    let reference = Reference::new(&frame, &model, &settings, output)?;
-    let decoder = decoder(arguments.decoder);
-    let profile = measure::profile(&reference.grid, &reference.matches, &model, decoder).with_points()?;
-    let linear = measure::profile(&reference.grid, &reference.matches, &model, Decoder::Linear);
-    // whatever can fail does so before the first file
-    let page = reports::profile_page(&frame, &reference, &profile, &linear, decoder, &settings)?;
-    make_folder(&arguments.out)?;
-    measure::write_profile(&arguments.out, &profile)?;
-    atomic::write_bytes(&arguments.out.join("report.html"), page.as_bytes())?;
-    let summary = processing::profile_summary(&profile);
-    let text = format!(
-        "{} of {} points, mean height {:.4} mm, σ of a height {:.2} µm, mean gap {:.2} µm\nreport: {}",
-        summary.ok,
-        summary.points,
-        summary.mean_h_mm,
-        summary.sigma_h_um,
-        summary.mean_gap_um,
-        arguments.out.join("report.html").display()
-    );
-    Ok(Answer::new(as_json(&summary)?, text))
-}
-
-pub fn displacement(arguments: &DisplacementArgs, output: &Output) -> Result<Answer, Error> {
-    let model = model(&arguments.optics)?;
-    let (frame, deformed) = images::read_pair(&arguments.reference, &arguments.deformed)?;
-    let settings = measure_settings(&arguments.dic);
-    let reference = Reference::new(&frame, &model, &settings, output)?;
-    let tracks = reference.track(&deformed, output)?;
-    let decoder = decoder(arguments.decoder);
-    let field = measure::displacement(
-        &reference.grid,
-        &reference.matches,
-        &tracks,
-        &model,
-        decoder,
-        settings.height_mm,
-    )
-    .with_points()?;
-    let page = reports::displacement_page(&frame, &reference, &field, decoder, &settings)?;
-    make_folder(&arguments.out)?;
-    measure::write_displacement(&arguments.out, &field)?;
-    atomic::write_bytes(&arguments.out.join("report.html"), page.as_bytes())?;
-    let summary = processing::field_summary(&field);
-    let [u, v, w] = summary.measured_um;
-    let [su, sv, sw] = summary.std_um;
-    let text = format!(
-        "{} of {} points: u {u:.3} µm (scatter {su:.3}), v {v:.3} µm ({sv:.3}), w {w:.3} µm ({sw:.3})\nreport: {}",
-        summary.ok,
-        summary.points,
-        arguments.out.join("report.html").display()
-    );
-    Ok(Answer::new(as_json(&summary)?, text))
 }
 
 pub fn init(arguments: &InitArgs) -> Result<Answer, Error> {
@@ -515,7 +438,9 @@ pub fn init(arguments: &InitArgs) -> Result<Answer, Error> {
     if path.exists() && !arguments.force {
         return Err(Error::Exists { path: path.clone() });
     }
-    atomic::write_bytes(path, experiment::template().as_bytes())?;
+    let template =
+        if arguments.microscope { experiment::microscope_template() } else { experiment::template() };
+    atomic::write_bytes(path, template.as_bytes())?;
     let text = format!("wrote {0}\nnext: daic simulate {0} --out dataset", path.display());
     Ok(Answer::new(json!({ "file": path.display().to_string() }), text))
 }

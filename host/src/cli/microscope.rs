@@ -10,7 +10,7 @@ use std::path::PathBuf;
 
 #[derive(Debug, Args)]
 pub struct MicroscopeArgs {
-    /// TOML file of the moves, each with the CSV file of its field (see docs/optics.md)
+    /// TOML file of the moves, each with the CSV file of its field (see docs/microscope.md)
     pub moves: PathBuf,
     /// Calibration to this file (.toml)
     #[arg(long, value_name = "FILE")]

@@ -3,6 +3,7 @@
 mod align;
 mod arguments;
 mod calibrate;
+mod calibrate_distortion;
 mod calibrate_rig;
 mod camera;
 mod commands;
@@ -10,6 +11,7 @@ mod microscope;
 mod output;
 mod plan;
 mod strain;
+mod surface;
 
 use arguments::{Cli, Command};
 use clap::Parser as _;
@@ -59,11 +61,13 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Probe(arguments) => strain::probe(arguments),
         Command::NoiseFloor(arguments) => strain::noise_floor(arguments, output),
         Command::Phase(arguments) => commands::phase(arguments, output),
-        Command::Profile(arguments) => commands::profile(arguments, output),
-        Command::Displacement(arguments) => commands::displacement(arguments, output),
+        Command::Decode(arguments) => surface::decode(arguments),
+        Command::Profile(arguments) => surface::profile(arguments, output),
+        Command::Displacement(arguments) => surface::displacement(arguments, output),
+        Command::Track(arguments) => surface::track(arguments, output),
         Command::Calibrate(arguments) => calibrate::calibrate(arguments, output),
         Command::Plan(arguments) => plan::plan(arguments),
-        Command::Align(arguments) => align::align(arguments),
+        Command::Align(arguments) => align::align(arguments, output),
         Command::Init(arguments) => commands::init(arguments),
         Command::Schema => commands::schema(),
         Command::Doctor(arguments) => commands::doctor(arguments),

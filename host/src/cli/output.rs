@@ -72,6 +72,13 @@ impl Output {
         }
     }
 
+    /// A line on stderr, for what cannot wait for the answer.
+    pub fn note(&self, line: &str) {
+        if !self.bar.is_hidden() || self.lines {
+            self.bar.suspend(|| eprintln!("{line}"));
+        }
+    }
+
     pub fn answer(&self, answer: &Answer) {
         self.bar.finish_and_clear();
         let text = if self.json { answer.json.to_string() } else { answer.text.clone() };

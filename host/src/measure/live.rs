@@ -1,11 +1,11 @@
 //! Frame after frame to height maps, in memory that is taken once.
 
 use super::matching::match_of;
-use super::{Grid, Match, Profile, Rectangle, Reference, Settings, profile};
+use super::{Grid, Instrument, Match, Profile, Rectangle, Reference, Settings, profile};
 use crate::error::Error;
 use crate::progress::Progress;
 use daic_correlate::{Guess, Image, Points, Reference as Subsets, Roi, ShapeParameters, Target, Workspace};
-use daic_dataset::GreyImage;
+use daic_dataset::{GreyImage, Lattice};
 use daic_optics::{Decoder, OpticalModel};
 
 /// Pixels around the views that are kept, so that the matched view may move.
@@ -14,8 +14,7 @@ const MARGIN: usize = 64;
 /// Matches the two views of every frame and decodes the surface. The views are found in the first
 /// frame; only their surroundings are looked at afterwards, and each frame starts from the last.
 pub struct Live {
-    model: OpticalModel,
-    decoder: Decoder,
+    instrument: Instrument,
     settings: Settings,
     /// Size of the frames.
     frame: (usize, usize),
@@ -45,7 +44,8 @@ impl Live {
     /// Finds and matches the views of a first frame.
     ///
     /// # Errors
-    /// As [`Reference::new`]; [`Error::NothingMeasured`] where no point was matched.
+    /// As [`Reference::new`]; [`Error::NothingMeasured`] where no point was matched; [`Error::LiveMosaic`] for a
+    /// channel of a mosaic sensor.
     pub fn new(
         frame: &GreyImage,
         model: &OpticalModel,
@@ -53,8 +53,12 @@ impl Live {
         settings: &Settings,
         progress: &dyn Progress,
     ) -> Result<Self, Error> {
+        if settings.lattice != Lattice::ALL {
+            return Err(Error::LiveMosaic);
+        }
         let first = Reference::new(frame, model, settings, progress)?;
-        profile(&first.grid, &first.matches, model, decoder).with_points()?;
+        let instrument = Instrument::new(model.clone(), decoder);
+        profile(&first.grid, &first.matches, &instrument).with_points()?;
         let mut shifts: Vec<[f64; 2]> = first
             .matches
             .iter()
@@ -86,8 +90,7 @@ impl Live {
         let points = Points::grid(w, h, settings.dic.subset, settings.step, &roi)?;
         let empty = || Image::from_u8(1, 1, &[0]);
         Ok(Self {
-            model: model.clone(),
-            decoder,
+            instrument,
             settings: settings.clone(),
             frame: (width, height),
             minus,
@@ -143,7 +146,7 @@ impl Live {
         self.matches.clear();
         for (p, last) in found.points.iter().zip(&mut self.last) {
             *last = p.status.is_ok().then_some(p.shape);
-            let mut m = match_of(p);
+            let mut m = match_of(p, Lattice::ALL);
             for c in 0..2 {
                 let at = [r.x, r.y][c] as f64;
                 m.pair.minus_px[c] += at;
@@ -151,6 +154,6 @@ impl Live {
             }
             self.matches.push(m);
         }
-        Ok(profile(&self.grid, &self.matches, &self.model, self.decoder))
+        Ok(profile(&self.grid, &self.matches, &self.instrument))
     }
 }

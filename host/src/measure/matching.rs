@@ -4,9 +4,10 @@ use super::{Grid, PointStatus};
 use crate::error::Error;
 use crate::progress::Progress;
 use daic_correlate::{
-    Correlation, Guess, Image, Observer, Point, Points, Reference as Subsets, Roi, Stage, Target, find_views,
+    Correlation, Guess, Image, Observer, Point, Points, Reference as Subsets, Roi, Stage, Target, Views,
+    find_views,
 };
-use daic_dataset::GreyImage;
+use daic_dataset::{GreyImage, Lattice};
 use daic_optics::{OpticalModel, PixelPair};
 
 pub use daic_correlate::Rectangle;
@@ -20,8 +21,10 @@ pub struct Settings {
     pub step: usize,
     /// Heights between which the surface is searched, millimetres.
     pub height_mm: [f64; 2],
-    /// Where the centres of subsets may lie in the −1 view; `None` takes the view found.
+    /// Where the centres of subsets may lie in the −1 view, sensor pixels; `None` takes the view found.
     pub roi: Option<Rectangle>,
+    /// Pixels that are used. Subsets and steps count these, positions are always those of the sensor.
+    pub lattice: Lattice,
 }
 
 impl Default for Settings {
@@ -37,8 +40,36 @@ impl Default for Settings {
             step: 5,
             height_mm: [-12.0, 12.0],
             roi: None,
+            lattice: Lattice::ALL,
         }
     }
+}
+
+impl Settings {
+    /// Overlapping subsets see the same pixels: how many points of a grid have one independent measurement
+    /// between them.
+    ///
+    /// A first-order subset averages over its whole area, so neighbours closer than its side share their noise:
+    /// (subset/step)² of them. The estimate of a second-order one rests on its middle: its kernel's noise is
+    /// 1 + 5/4 + 5/4 = 3.5 times that of the mean over the square (the constant beside x² and y²), and shared
+    /// by so many times fewer points.
+    pub fn points_per_measurement(&self) -> f64 {
+        points_per_measurement(self.dic.subset as f64 / self.step as f64, self.dic.shape)
+    }
+
+    /// Over how many points along either axis neighbours share their noise.
+    pub fn overlap(&self) -> f64 {
+        self.points_per_measurement().sqrt()
+    }
+}
+
+/// [`Settings::points_per_measurement`] for subsets `ratio` times as wide as the distance of points.
+pub fn points_per_measurement(ratio: f64, shape: daic_correlate::Shape) -> f64 {
+    let narrower = match shape {
+        daic_correlate::Shape::Quadratic => 3.5,
+        _ => 1.0,
+    };
+    (ratio * ratio / narrower).max(1.0)
 }
 
 /// Beyond the v that the optics expect, this much is searched: gratings rotated by 10 mrad.
@@ -113,6 +144,29 @@ impl Observer for Named<'_> {
     }
 }
 
+/// The pixels of the settings' lattice, as the correlation wants them.
+fn lattice_image(frame: &GreyImage, lattice: Lattice) -> Result<Image, Error> {
+    if lattice == Lattice::ALL { image_of(frame) } else { image_of(&lattice.of(frame)) }
+}
+
+/// A rectangle of the lattice in pixels of the sensor.
+fn on_sensor(r: Rectangle, lattice: Lattice) -> Rectangle {
+    let (pitch, [x, y]) = (lattice.pitch as usize, lattice.origin.map(|o| o as usize));
+    Rectangle { x: pitch * r.x + x, y: pitch * r.y + y, width: pitch * r.width, height: pitch * r.height }
+}
+
+/// The pixels of the lattice in a rectangle of the sensor.
+fn in_lattice(r: Rectangle, lattice: Lattice) -> Rectangle {
+    let pitch = lattice.pitch as usize;
+    let along = |at: usize, length: usize, origin: u32| {
+        let first = |edge: usize| edge.saturating_sub(origin as usize).div_ceil(pitch);
+        (first(at), first(at + length) - first(at))
+    };
+    let (x, width) = along(r.x, r.width, lattice.origin[0]);
+    let (y, height) = along(r.y, r.height, lattice.origin[1]);
+    Rectangle { x, y, width, height }
+}
+
 /// Grey levels as the correlation wants them.
 ///
 /// # Errors
@@ -125,8 +179,8 @@ pub(super) fn displaced(point: &Point) -> [f64; 2] {
     [point.x + point.u, point.y + point.v]
 }
 
-fn sigma(point: &Point) -> [f64; 2] {
-    [f64::from(point.sigma_u), f64::from(point.sigma_v)]
+fn sigma(point: &Point, lattice: Lattice) -> [f64; 2] {
+    [point.sigma_u, point.sigma_v].map(|s| f64::from(s) * f64::from(lattice.pitch))
 }
 
 pub(super) fn grid_of(points: &Points) -> Grid {
@@ -155,14 +209,53 @@ impl Reference {
         settings: &Settings,
         progress: &dyn Progress,
     ) -> Result<Self, Error> {
-        let image = image_of(frame)?;
+        let lattice = settings.lattice;
+        Self::matched(frame, settings, progress, |views| {
+            disparity(model, &on_sensor(views.minus.bounds, lattice), settings.height_mm)
+        })
+    }
+
+    /// The same without any optics: displacements are searched up to `margin_px` (sensor pixels) from the one
+    /// that lays the outlines of the two views upon each other.
+    ///
+    /// # Errors
+    /// As [`Reference::new`].
+    pub fn by_outlines(
+        frame: &GreyImage,
+        margin_px: f64,
+        settings: &Settings,
+        progress: &dyn Progress,
+    ) -> Result<Self, Error> {
+        Self::matched(frame, settings, progress, |views| {
+            let [a, b] = [&views.minus.bounds, &views.plus.bounds].map(|r| on_sensor(*r, settings.lattice));
+            let middle = |at: usize, length: usize| at as f64 + 0.5 * length as f64;
+            let u = middle(b.x, b.width) - middle(a.x, a.width);
+            let v = middle(b.y, b.height) - middle(a.y, a.height);
+            Ok(([u - margin_px, u + margin_px], [v - margin_px, v + margin_px]))
+        })
+    }
+
+    /// `search` gives the displacements (u, v) to be searched between the views, sensor pixels.
+    fn matched(
+        frame: &GreyImage,
+        settings: &Settings,
+        progress: &dyn Progress,
+        search: impl FnOnce(&Views) -> Result<([f64; 2], [f64; 2]), Error>,
+    ) -> Result<Self, Error> {
+        let lattice = settings.lattice;
+        let image = lattice_image(frame, lattice)?;
         settings.dic.validate_for(image.width(), image.height())?;
         progress.stage("finding the two views", 0);
         let found = find_views(&image)?;
-        let rectangle = settings.roi.or_else(|| centres(&found.minus.bounds, settings.dic.radius()));
+        let rectangle = settings
+            .roi
+            .map(|roi| in_lattice(roi, lattice))
+            .or_else(|| centres(&found.minus.bounds, settings.dic.radius()));
         let roi = Roi { rectangle, mask: Some(&found.minus.mask) };
         let points = Points::grid(image.width(), image.height(), settings.dic.subset, settings.step, &roi)?;
-        let guess = disparity(model, &found.minus.bounds, settings.height_mm)?;
+        let pitch = f64::from(lattice.pitch);
+        let (u, v) = search(&found)?;
+        let guess = Guess::Search { u: (u[0] / pitch, u[1] / pitch), v: (v[0] / pitch, v[1] / pitch) };
         let target = Target::new(image.clone(), settings.dic.interpolation);
         let subsets = Subsets::new(image);
         let matched = daic_correlate::correlate(
@@ -173,15 +266,19 @@ impl Reference {
             &settings.dic,
             &Named("matching the two views", progress),
         )?;
-        let matches = matched.points.iter().map(match_of).collect();
+        let matches = matched.points.iter().map(|point| match_of(point, lattice)).collect();
+        let mut grid = grid_of(&points);
+        [grid.x0, grid.y0] = [(grid.x0, 0), (grid.y0, 1)]
+            .map(|(at, axis)| at * lattice.pitch as usize + lattice.origin[axis] as usize);
+        grid.step *= lattice.pitch as usize;
         Ok(Self {
             subsets,
-            grid: grid_of(&points),
+            grid,
             points,
             settings: settings.clone(),
-            minus: found.minus.bounds,
+            minus: on_sensor(found.minus.bounds, lattice),
             minus_mask: found.minus.mask,
-            plus: found.plus.bounds,
+            plus: on_sensor(found.plus.bounds, lattice),
             matches,
         })
     }
@@ -194,7 +291,8 @@ impl Reference {
     /// # Errors
     /// If the frame has another size.
     pub fn track(&self, frame: &GreyImage, progress: &dyn Progress) -> Result<Tracks, Error> {
-        let target = Target::new(image_of(frame)?, self.settings.dic.interpolation);
+        let lattice = self.settings.lattice;
+        let target = Target::new(lattice_image(frame, lattice)?, self.settings.dic.interpolation);
         let run = |points: &Points, name| -> Result<Correlation, Error> {
             let observer = Named(name, progress);
             Ok(daic_correlate::correlate(
@@ -209,7 +307,7 @@ impl Reference {
         let minus = run(&self.points, "tracking in the −1 view")?;
         let matched: Vec<usize> =
             (0..self.matches.len()).filter(|&k| self.matches[k].status.is_ok()).collect();
-        let positions = matched.iter().map(|&k| self.matches[k].pair.plus_px).collect();
+        let positions = matched.iter().map(|&k| lattice.from_sensor(self.matches[k].pair.plus_px)).collect();
         let plus = run(&Points::scattered(positions)?, "tracking in the +1 view")?;
 
         let mut points: Vec<Track> = self
@@ -217,9 +315,9 @@ impl Reference {
             .iter()
             .zip(&minus.points)
             .map(|(m, p)| Track {
-                minus_px: displaced(p),
+                minus_px: lattice.to_sensor(displaced(p)),
                 plus_px: [f64::NAN; 2],
-                sigma_minus_px: sigma(p),
+                sigma_minus_px: sigma(p, lattice),
                 sigma_plus_px: [f64::NAN; 2],
                 status: if !m.status.is_ok() {
                     m.status
@@ -232,8 +330,8 @@ impl Reference {
             .collect();
         for (&k, p) in matched.iter().zip(&plus.points) {
             let track = &mut points[k];
-            track.plus_px = displaced(p);
-            track.sigma_plus_px = sigma(p);
+            track.plus_px = lattice.to_sensor(displaced(p));
+            track.sigma_plus_px = sigma(p, lattice);
             if track.status.is_ok() && !p.status.is_ok() {
                 track.status = PointStatus::TrackPlus(p.status.name());
             }
@@ -255,20 +353,27 @@ fn centres(view: &Rectangle, radius: usize) -> Option<Rectangle> {
     (width > 0 && height > 0).then_some(Rectangle { x: view.x + left, y: view.y + top, width, height })
 }
 
-pub(super) fn match_of(point: &Point) -> Match {
+/// A point of the lattice's image in pixels of the sensor.
+pub(super) fn match_of(point: &Point, lattice: Lattice) -> Match {
     let ok = point.status.is_ok();
     Match {
         pair: PixelPair {
-            minus_px: [point.x, point.y],
-            plus_px: if ok { displaced(point) } else { [f64::NAN; 2] },
+            minus_px: lattice.to_sensor([point.x, point.y]),
+            plus_px: if ok { lattice.to_sensor(displaced(point)) } else { [f64::NAN; 2] },
         },
-        sigma_px: sigma(point),
+        sigma_px: sigma(point, lattice),
         status: if ok { PointStatus::Ok } else { PointStatus::Match(point.status.name()) },
     }
 }
 
-/// Displacements to be searched from the −1 to the +1 view: what the heights allow over the whole view.
-fn disparity(model: &OpticalModel, view: &Rectangle, height_mm: [f64; 2]) -> Result<Guess<'static>, Error> {
+/// Displacements (u, v) to be searched from the −1 to the +1 view: what the heights allow over the whole view.
+fn disparity(
+    model: &OpticalModel,
+    view: &Rectangle,
+    height_mm: [f64; 2],
+) -> Result<([f64; 2], [f64; 2]), Error> {
+    // distortion is small against the margins; and maps end where they were measured, the search may go beyond
+    let model = OpticalModel::new(model.optics())?;
     let (left, top) = (view.x as f64, view.y as f64);
     let (right, bottom) = (left + view.width as f64, top + view.height as f64);
     let (mut u, mut v) = ((f64::INFINITY, f64::NEG_INFINITY), (f64::INFINITY, f64::NEG_INFINITY));
@@ -278,5 +383,5 @@ fn disparity(model: &OpticalModel, view: &Rectangle, height_mm: [f64; 2]) -> Res
         v = (v.0.min(range.v_px[0]), v.1.max(range.v_px[1]));
     }
     let margin = U_MARGIN * u.0.abs().max(u.1.abs());
-    Ok(Guess::Search { u: (u.0 - margin, u.1 + margin), v: (v.0 - V_MARGIN_PX, v.1 + V_MARGIN_PX) })
+    Ok(([u.0 - margin, u.1 + margin], [v.0 - V_MARGIN_PX, v.1 + V_MARGIN_PX]))
 }

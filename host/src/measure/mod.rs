@@ -6,17 +6,27 @@
 
 mod decode;
 mod files;
+mod gap;
+mod instrument;
 mod live;
 mod matching;
+mod object;
 mod statistics;
+mod surface;
 
+pub(crate) use decode::mark_gaps;
 pub use decode::{Displacement, DisplacementPoint, Profile, ProfilePoint, displacement, profile};
 pub use files::{
-    displacement_maps, displacement_table, height_map, profile_table, write_displacement, write_profile,
+    ObjectOptions, displacement_maps, displacement_table, map_named, profile_maps, profile_table,
+    write_displacement, write_profile,
 };
+pub use gap::{GapField, GapSummary};
+pub use instrument::{Instrument, MapQuality};
 pub use live::Live;
-pub use matching::{Match, Rectangle, Reference, Settings, Track, Tracks, image_of};
+pub use matching::{Match, Rectangle, Reference, Settings, Track, Tracks, image_of, points_per_measurement};
+pub use object::ObjectGrid;
 pub use statistics::{Plane, Spread, plane_of, spread};
+pub use surface::{SurfaceField, SurfaceSummary, strain_status, surface_strain};
 
 /// Why a point has no result, or `ok`. Stable strings: they stand in files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -31,7 +41,11 @@ pub enum PointStatus {
     TrackPlus(&'static str),
     /// The optics has no such ray.
     Decode,
-    /// The two rays miss each other by more than their uncertainty explains.
+    /// The rays part, or meet on the camera's side of the grating: no specimen is there.
+    BeforeGrating,
+    /// Outside the distortion map or the volume in which the optics were calibrated.
+    Outside,
+    /// The two rays miss each other by more than those around, and than noise explains.
     Gap,
     /// The point lies far outside the heights that were searched.
     Range,
@@ -41,6 +55,11 @@ impl PointStatus {
     /// Whether the point has a result.
     pub fn is_ok(self) -> bool {
         self == Self::Ok
+    }
+
+    /// Whether the correlation found the point.
+    pub(crate) fn is_matched(self) -> bool {
+        !matches!(self, Self::Match(_) | Self::TrackMinus(_) | Self::TrackPlus(_))
     }
 }
 
@@ -52,6 +71,8 @@ impl std::fmt::Display for PointStatus {
             Self::TrackMinus(reason) => write!(f, "minus:{reason}"),
             Self::TrackPlus(reason) => write!(f, "plus:{reason}"),
             Self::Decode => f.write_str("decode"),
+            Self::BeforeGrating => f.write_str("before_grating"),
+            Self::Outside => f.write_str("outside"),
             Self::Gap => f.write_str("gap"),
             Self::Range => f.write_str("range"),
         }

@@ -8,7 +8,8 @@
 
 use super::MicroscopeFileError;
 use crate::error::Error;
-use daic_dataset::Table;
+use crate::measure::{Match, Track, Tracks};
+use daic_dataset::{Column, Table};
 use daic_optics::microscope::calibrate::FieldPoint;
 use std::path::Path;
 
@@ -78,4 +79,51 @@ pub(super) fn read(path: &Path, sigma_px: Option<f64>) -> Result<Vec<FieldPoint>
         points.push(point);
     }
     Ok(points)
+}
+
+/// (u₋, v₋, u₊, v₊) of a matched point that was tracked.
+pub(super) fn moved(matched: &Match, track: &Track) -> [f64; 4] {
+    let (from, to) = (matched.pair, track);
+    let [a, b] = [0, 1].map(|i| to.minus_px[i] - from.minus_px[i]);
+    let [c, d] = [0, 1].map(|i| to.plus_px[i] - from.plus_px[i]);
+    [a, b, c, d]
+}
+
+/// Standard deviations of the same.
+pub(super) fn sigmas(track: &Track) -> [f64; 4] {
+    let ([a, b], [c, d]) = (track.sigma_minus_px, track.sigma_plus_px);
+    [a, b, c, d]
+}
+
+/// The field of a frame as [`read`] takes it: matched points of the reference, a row each; `height_um` gives the
+/// height before the motion.
+///
+/// # Errors
+/// Only if two columns had one name.
+pub(super) fn table(
+    matches: &[Match],
+    tracks: &Tracks,
+    height_um: Option<&dyn Fn(&Match) -> f64>,
+) -> Result<Table, Error> {
+    let both = || matches.iter().zip(&tracks.points);
+    let mut table = Table::new();
+    let mut push = |name: &str, f: &dyn Fn(&Match, &Track) -> f64| {
+        table.push(name, Column::F64(both().map(|(m, t)| f(m, t)).collect()))
+    };
+    let pair: [fn(&Match) -> f64; 4] =
+        [|m| m.pair.minus_px[0], |m| m.pair.minus_px[1], |m| m.pair.plus_px[0], |m| m.pair.plus_px[1]];
+    for (name, value) in PAIR.into_iter().zip(pair) {
+        push(name, &|m, _| value(m))?;
+    }
+    for (i, name) in MOVED.into_iter().enumerate() {
+        push(name, &|m, t| moved(m, t)[i])?;
+    }
+    for (i, name) in SIGMA.into_iter().enumerate() {
+        push(name, &|_, t| sigmas(t)[i])?;
+    }
+    if let Some(height_um) = height_um {
+        push("h_um", &|m, _| height_um(m))?;
+    }
+    table.push("status", Column::Text(tracks.points.iter().map(|t| t.status.to_string()).collect()))?;
+    Ok(table)
 }

@@ -1,9 +1,11 @@
 //! The file of a calibrated microscope.
 
-use super::{Calibration, MicroscopeFileError, Moves};
+use super::{Calibration, Instrument, MicroscopeFileError, Moves};
 use crate::error::Error;
 use daic_dataset::atomic;
+use daic_optics::microscope::calibrate::{Motion, MotionResult};
 use daic_optics::microscope::{Form, Microscope, Parameters};
+use nalgebra::SMatrix;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -21,8 +23,58 @@ pub struct MicroscopeFile {
     pub provenance: String,
     /// The parameters.
     pub microscope: MicroscopeSection,
+    /// What the calibration's points filled; left out, not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reach: Option<Reach>,
     /// How well they fit.
     pub fit: Fit,
+}
+
+/// The part of field and depth that the points of a calibration filled: beyond it points are extrapolated.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Reach {
+    /// Lowest and highest x of midpoint pixels.
+    pub x_px: [f64; 2],
+    /// Lowest and highest y.
+    pub y_px: [f64; 2],
+    /// Lowest and highest height, µm.
+    pub height_um: [f64; 2],
+}
+
+impl Reach {
+    /// Part of a side by which a point may lie outside.
+    const MARGIN: f64 = 0.1;
+
+    fn of(motions: &[Motion], results: &[MotionResult]) -> Option<Self> {
+        let mut sides = [[f64::INFINITY, f64::NEG_INFINITY]; 3];
+        for (motion, result) in motions.iter().zip(results).filter(|(m, _)| m.fit) {
+            // a rotation's own heights are left out: its pivot may lie anywhere
+            let w_um =
+                if result.translation_mm[2].is_finite() { 1e3 * result.translation_mm[2] } else { 0.0 };
+            for p in &motion.points {
+                let h_um = 1e3 * p.height_mm;
+                let [x, y] = p.middle_px;
+                let values = [[x, x], [y, y], [h_um.min(h_um + w_um), h_um.max(h_um + w_um)]];
+                for (side, value) in sides.iter_mut().zip(values) {
+                    *side = [side[0].min(value[0]), side[1].max(value[1])];
+                }
+            }
+        }
+        let [x_px, y_px, height_um] = sides;
+        (x_px[0] <= x_px[1]).then_some(Self { x_px, y_px, height_um })
+    }
+
+    /// Whether a point lies inside or hardly outside.
+    pub fn covers(&self, middle_px: [f64; 2], height_mm: f64) -> bool {
+        let inside = |value: f64, [low, high]: [f64; 2]| {
+            let margin = Self::MARGIN * (high - low);
+            (low - margin..=high + margin).contains(&value)
+        };
+        inside(middle_px[0], self.x_px)
+            && inside(middle_px[1], self.y_px)
+            && inside(1e3 * height_mm, self.height_um)
+    }
 }
 
 /// The parameters and their covariance.
@@ -86,7 +138,7 @@ impl MicroscopeFile {
     /// The only format there is.
     pub const FORMAT: &'static str = "daic-microscope/1";
 
-    pub(super) fn of(c: &Calibration, moves: &Moves, path: &Path) -> Option<Self> {
+    pub(super) fn of(c: &Calibration, moves: &Moves, motions: &[Motion], path: &Path) -> Option<Self> {
         let (p, covariance) = (c.parameters?, c.covariance?);
         // millimetres to micrometres in β₁ and β₂
         let factor = [1e3, 1e3, 1.0, 1.0, 1.0, 1.0];
@@ -95,7 +147,7 @@ impl MicroscopeFile {
         Some(Self {
             format: Self::FORMAT.to_owned(),
             program: format!("daic {}", env!("CARGO_PKG_VERSION")),
-            date: moves.date.clone().unwrap_or_else(today),
+            date: moves.date.clone().unwrap_or_else(crate::camera_file::today),
             provenance: format!("{told}calibrated from {name}"),
             microscope: MicroscopeSection {
                 form: c.form,
@@ -108,6 +160,7 @@ impl MicroscopeFile {
                     std::array::from_fn(|j| covariance[(i, j)] * factor[i] * factor[j])
                 }),
             },
+            reach: Reach::of(motions, &c.motions),
             fit: Fit {
                 rms_px: c.rms_px,
                 chi_square_reduced: c.chi_square_reduced,
@@ -159,6 +212,14 @@ impl MicroscopeFile {
                 }
             }
         }
+        let matrix = nalgebra::DMatrix::from_fn(6, 6, |i, j| c[i][j]);
+        let eigenvalue = daic_optics::least_correlation_eigenvalue(&matrix);
+        if eigenvalue < daic_optics::LEAST_EIGENVALUE {
+            return Err(wrong(format!(
+                "microscope.covariance is of no possible errors: the smallest eigenvalue of its correlations is {eigenvalue}, it must not be below 0"
+            ))
+            .into());
+        }
         Ok(file)
     }
 
@@ -181,6 +242,31 @@ impl MicroscopeFile {
         Microscope::new(parameters, m.form, reference_disparity_px)
     }
 
+    /// Whether a file says that it is a microscope's, of whatever version.
+    pub fn is_one(path: &Path) -> bool {
+        #[derive(Deserialize)]
+        struct Head {
+            format: String,
+        }
+        let text = std::fs::read_to_string(path).unwrap_or_default();
+        // whatever else is wrong with the file, reading it whole says so
+        toml::from_str::<Head>(&text).is_ok_and(|head| head.format.starts_with("daic-microscope"))
+    }
+
+    /// Ready to decode, with the disparity of the plane h = 0.
+    ///
+    /// # Errors
+    /// The first parameter that is not allowed.
+    pub fn instrument(
+        &self,
+        reference_disparity_px: [f64; 2],
+    ) -> Result<Instrument, daic_optics::microscope::MicroscopeError> {
+        // of the file's micrometres, millimetres
+        let factor = [1e-3, 1e-3, 1.0, 1.0, 1.0, 1.0];
+        let covariance = SMatrix::from_fn(|i, j| self.microscope.covariance[i][j] * factor[i] * factor[j]);
+        Ok(Instrument { model: self.model(reference_disparity_px)?, covariance, reach: self.reach })
+    }
+
     /// Writes the file.
     ///
     /// # Errors
@@ -189,44 +275,5 @@ impl MicroscopeFile {
         let text = toml::to_string(self)
             .map_err(|e| Error::Unwritable { path: path.to_owned(), reason: e.to_string() })?;
         Ok(atomic::write_bytes(path, text.as_bytes())?)
-    }
-}
-
-/// Today's date, UTC, as 2026-01-31.
-fn today() -> String {
-    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
-    date(since.map_or(0, |s| s.as_secs() / 86_400))
-}
-
-/// Date of a number of days after 1970-01-01.
-fn date(days: u64) -> String {
-    // Counted from 1 March of year 0, so that the leap day is the last of a year: 146 097 days in
-    // every 400 years.
-    let z = days + 719_468;
-    let (era, day) = (z / 146_097, z % 146_097);
-    let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;
-    let of_year = day - (365 * year + year / 4 - year / 100);
-    let month = (5 * of_year + 2) / 153;
-    let of_month = of_year - (153 * month + 2) / 5 + 1;
-    let (month, carry) = if month < 10 { (month + 3, 0) } else { (month - 9, 1) };
-    format!("{:04}-{month:02}-{of_month:02}", era * 400 + year + carry)
-}
-
-#[cfg(test)]
-mod tests {
-    #[test]
-    fn dates() {
-        // from `date -u -d @…`
-        for (days, text) in [
-            (0, "1970-01-01"),
-            (59, "1970-03-01"),
-            (789, "1972-02-29"),
-            (11_016, "2000-02-29"),
-            (20_454, "2026-01-01"),
-            (47_540, "2100-02-28"),
-            (47_541, "2100-03-01"),
-        ] {
-            assert_eq!(super::date(days), text);
-        }
     }
 }

@@ -3,10 +3,13 @@
 //! A file of moves ([`Moves`]) names for each known motion a CSV file with the image displacements of
 //! its points; the result is a [`MicroscopeFile`].
 
+mod decode;
 mod field;
 mod file;
+mod known;
 mod moves;
 mod report;
+mod track;
 
 use crate::error::Error;
 use daic_optics::microscope::calibrate::{
@@ -16,9 +19,12 @@ use daic_optics::microscope::{Candidate, Form, Quantity};
 use serde::Serialize;
 use std::path::Path;
 
-pub use file::{Fit, FittedMotion, MicroscopeFile, MicroscopeSection};
+pub use decode::{Instrument, displacement, profile};
+pub use file::{Fit, FittedMotion, MicroscopeFile, MicroscopeSection, Reach};
+pub use known::{CalibratedModel, KnownMove, MoveSettings, from_moves, mean_disparity};
 pub use moves::{Component, Correlation, MotionEntry, Moves};
 pub use report::page;
+pub use track::{TrackOptions, Tracked, track};
 
 /// What is wrong with a file of moves, of fields or of a microscope.
 #[derive(Debug, thiserror::Error)]
@@ -129,6 +135,52 @@ fn motion(m: &MotionResult, predicted: Option<&MotionResult>) -> MotionSummary {
     }
 }
 
+/// Adds what the uncertainty of the moves themselves does to the estimates: each known component of each fitted motion is
+/// changed by its σ in turn, and the calibration repeated.
+fn add_stage(
+    calibration: &mut Calibration,
+    motions: &[Motion],
+    settings: &Settings,
+    moves: &Moves,
+) -> Result<(), Error> {
+    let [translation, rotation] = [
+        moves.translation_sigma.map_or(0.0, daic_rig::units::Length::mm),
+        moves.rotation_sigma.map_or(0.0, daic_rig::units::Angle::rad),
+    ];
+    let turned = |m: &Motion| m.rotation_rad.iter().any(|r| *r != 0.0);
+    let mut changed = motions.to_vec();
+    let mut changes = Vec::new();
+    for (k, motion) in motions.iter().enumerate().filter(|(_, m)| m.fit) {
+        for axis in 0..3 {
+            if let (Some(at), true) = (motion.translation_mm[axis], translation > 0.0) {
+                changed[k].translation_mm[axis] = Some(at + translation);
+                changes.push(calibrate(&changed, settings)?);
+                changed[k].translation_mm[axis] = Some(at);
+            }
+            if rotation > 0.0 && turned(motion) {
+                changed[k].rotation_rad[axis] += rotation;
+                changes.push(calibrate(&changed, settings)?);
+                changed[k].rotation_rad[axis] = motion.rotation_rad[axis];
+            }
+        }
+    }
+    let before = calibration.clone();
+    for other in &changes {
+        for e in &mut calibration.estimates {
+            let by =
+                other.estimate(e.quantity).zip(before.estimate(e.quantity)).map(|(o, b)| o.value - b.value);
+            e.sigma = e.sigma.hypot(by.unwrap_or(0.0));
+        }
+        if let (Some(covariance), Some(p), Some(q)) =
+            (&mut calibration.covariance, before.parameters, other.parameters)
+        {
+            let by = nalgebra::SVector::from(q.to_array()) - nalgebra::SVector::from(p.to_array());
+            *covariance += by * by.transpose();
+        }
+    }
+    Ok(())
+}
+
 /// Calibrates from a file of moves and the fields it names.
 ///
 /// # Errors
@@ -137,8 +189,9 @@ pub fn run(path: &Path) -> Result<Calibrated, Error> {
     let moves = Moves::load(path)?;
     let motions = moves.motions(path)?;
     let settings = moves.settings();
-    let calibration = calibrate(&motions, &settings)?;
-    let predicted = leave_one_out(&motions, &settings)?;
+    let mut calibration = calibrate(&motions, &settings)?;
+    add_stage(&mut calibration, &motions, &settings, &moves)?;
+    let predicted = leave_one_out(&motions, &settings);
     let form = match settings.form {
         Form::Linear => Form::Perspective,
         Form::Perspective => Form::Linear,
@@ -176,6 +229,6 @@ pub fn run(path: &Path) -> Result<Calibrated, Error> {
         motions: calibration.motions.iter().zip(&predicted).map(|(m, p)| motion(m, p.as_ref())).collect(),
         notes,
     };
-    let file = MicroscopeFile::of(&calibration, &moves, path);
+    let file = MicroscopeFile::of(&calibration, &moves, &motions, path);
     Ok(Calibrated { summary, file, motions, calibration })
 }

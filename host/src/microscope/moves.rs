@@ -2,8 +2,10 @@
 
 use super::{MicroscopeFileError, field};
 use crate::error::Error;
+use crate::measure::points_per_measurement;
 use daic_optics::microscope::Form;
 use daic_optics::microscope::calibrate::{Motion, Settings};
+use daic_rig::experiment::Shape;
 use daic_rig::units::{Angle, Length, Pixels};
 use serde::{Deserialize, Deserializer};
 use std::path::{Path, PathBuf};
@@ -30,6 +32,12 @@ pub struct Moves {
     /// Subsets of the correlation: where they overlap, neighbours share their noise.
     #[serde(default)]
     pub correlation: Option<Correlation>,
+    /// Standard deviation of every known component of a translation; left out, they are taken as exact.
+    #[serde(default)]
+    pub translation_sigma: Option<Length>,
+    /// Standard deviation of every component of a rotation; left out, they are taken as exact.
+    #[serde(default)]
+    pub rotation_sigma: Option<Angle>,
     /// The motions.
     pub motion: Vec<MotionEntry>,
 }
@@ -42,6 +50,13 @@ pub struct Correlation {
     pub subset: Pixels,
     /// Distance of points.
     pub step: Pixels,
+    /// Shape function; left out, affine.
+    #[serde(default = "affine")]
+    pub shape: Shape,
+}
+
+fn affine() -> Shape {
+    Shape::Affine
 }
 
 /// One motion.
@@ -121,6 +136,15 @@ impl Moves {
             ))
             .into());
         }
+        let sigmas = [
+            ("translation_sigma", moves.translation_sigma.map(Length::mm)),
+            ("rotation_sigma", moves.rotation_sigma.map(Angle::rad)),
+        ];
+        for (name, sigma) in sigmas {
+            if let Some(sigma) = sigma.filter(|s| !(s.is_finite() && *s >= 0.0)) {
+                return Err(wrong(format!("{name} is {sigma}, it must not be below 0")).into());
+            }
+        }
         for (i, m) in moves.motion.iter().enumerate() {
             if m.translation.is_none() && m.rotation.is_none() {
                 return Err(wrong(format!(
@@ -134,7 +158,14 @@ impl Moves {
     }
 
     pub(super) fn settings(&self) -> Settings {
-        let shared = self.correlation.map_or(1.0, |c| (c.subset.px() / c.step.px()).powi(2).max(1.0));
+        let shared = self.correlation.map_or(1.0, |c| {
+            let shape = match c.shape {
+                Shape::Translation => daic_correlate::Shape::Translation,
+                Shape::Affine => daic_correlate::Shape::Affine,
+                Shape::Quadratic => daic_correlate::Shape::Quadratic,
+            };
+            points_per_measurement(c.subset.px() / c.step.px(), shape)
+        });
         Settings { form: self.form, shared, ..Settings::default() }
     }
 

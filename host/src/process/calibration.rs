@@ -5,7 +5,8 @@ use crate::error::Error;
 use crate::measure::{self, Match, Tracks};
 use daic_optics::calibrate::{Observation, Settings, TrackedPoint, calibrate};
 use daic_optics::{Decoder, OpticalModel, Optics, Parameter, PixelPair};
-use nalgebra::Vector3;
+use daic_rig::experiment::Covariance;
+use nalgebra::{Matrix3x2, Vector3};
 
 /// Points within this radius of the optical axis make the surface whose height there is known.
 const AXIS_RADIUS_MM: f64 = 1.5;
@@ -13,6 +14,16 @@ const AXIS_RADIUS_MM: f64 = 1.5;
 const AXIS_POINTS: usize = 30;
 /// What a sub-pixel σ of zero would claim no camera can; keeps the weights finite.
 const LEAST_SIGMA_PX: f64 = 1e-4;
+
+/// Optics, and how sure they are.
+pub struct Calibrated {
+    /// The set-up.
+    pub optics: Optics,
+    /// Covariance of what was calibrated.
+    pub covariance: Option<Covariance>,
+    /// What was found; none without a calibration.
+    pub summary: Option<CalibrationSummary>,
+}
 
 /// One calibration frame: where the stage stood relative to the reference, and the tracked points.
 pub struct Moved {
@@ -27,7 +38,7 @@ pub struct Moved {
 /// Moves alone say nothing about d: it only says from where heights are counted. So the height of the
 /// specimen where the optical axis meets it, at the reference position, is the datum.
 ///
-/// `shared` (see [`shared_information`]) is how many points have one independent measurement between them.
+/// `shared` (see [`measure::Settings::points_per_measurement`]) is how many points have one independent measurement between them.
 ///
 /// # Errors
 /// If the moves do not determine a parameter, or there is no surface near the axis.
@@ -37,7 +48,7 @@ pub fn run(
     moved: &[Moved],
     axis_height_mm: f64,
     shared: f64,
-) -> Result<(Optics, CalibrationSummary), Error> {
+) -> Result<Calibrated, Error> {
     let mut displacements = vec![Vector3::zeros()];
     displacements.extend(moved.iter().map(|m| Vector3::from(m.displacement_mm)));
     let points: Vec<TrackedPoint> = (0..matches.len())
@@ -64,7 +75,8 @@ pub fn run(
     let mut optics = found.optics;
 
     let model = OpticalModel::new(&optics)?;
-    let surface = measure::profile(&measure::Grid::none(), matches, &model, Decoder::Ray);
+    let instrument = measure::Instrument::new(model.clone(), Decoder::Ray);
+    let surface = measure::profile(&measure::Grid::none(), matches, &instrument);
     let near: Vec<[f64; 3]> = surface
         .points
         .iter()
@@ -78,21 +90,22 @@ pub fn run(
     })?;
     optics.grating_to_reference_mm += axis_height_mm - height;
 
+    let covariance = covariance(&found, &model, height_sigma, shared);
     let mut parameters: Vec<CalibratedParameter> = found
         .estimates
         .iter()
         .map(|e| CalibratedParameter {
             name: unit_name(e.parameter).to_owned(),
-            start: e.start,
+            start: Some(e.start),
             value: e.value,
             sigma: e.sigma * shared.sqrt(),
         })
         .collect();
     parameters.push(CalibratedParameter {
         name: unit_name(Parameter::GratingToReference).to_owned(),
-        start: start.grating_to_reference_mm,
+        start: Some(start.grating_to_reference_mm),
         value: optics.grating_to_reference_mm,
-        sigma: datum_sigma(&found, &model, height_sigma) * shared.sqrt(),
+        sigma: covariance.as_ref().map_or(f64::NAN, |c| c.matrix[2][2].sqrt()),
     });
     let summary = CalibrationSummary {
         parameters,
@@ -102,23 +115,28 @@ pub fn run(
         observations: found.observations,
         rejected: found.rejected.len(),
     };
-    Ok((optics, summary))
+    Ok(Calibrated { optics, covariance, summary: Some(summary) })
 }
 
-/// Overlapping subsets see the same pixels: how many points of a grid have one independent measurement
-/// between them.
-///
-/// A first-order subset averages over its whole area, so neighbours closer than its side share their noise:
-/// (subset/step)² of them. The estimate of a second-order one rests on its middle: its kernel's noise is
-/// 1 + 5/4 + 5/4 = 3.5 times that of the mean over the square (the constant beside x² and y²), and shared by
-/// so many times fewer points.
-pub fn shared_information(settings: &measure::Settings) -> f64 {
-    let ratio = settings.dic.subset as f64 / settings.step as f64;
-    let narrower = match settings.dic.shape {
-        daic_correlate::Shape::Quadratic => 3.5,
-        _ => 1.0,
-    };
-    (ratio * ratio / narrower).max(1.0)
+/// Covariance of F, s and d. F and s are those of the moves; an error of theirs moves the height on the axis, and d,
+/// which puts that height right, the other way.
+fn covariance(
+    found: &daic_optics::calibrate::Calibration,
+    model: &OpticalModel,
+    height_sigma: f64,
+    shared: f64,
+) -> Option<Covariance> {
+    let [by_f, by_s] = height_by(model)?;
+    let carry = Matrix3x2::new(1.0, 0.0, 0.0, 1.0, -by_f, -by_s);
+    let mut all = carry * found.covariance.fixed_view::<2, 2>(0, 0) * carry.transpose();
+    all[(2, 2)] += height_sigma * height_sigma;
+    // symmetric to the last bit
+    let all = (all + all.transpose()) * (0.5 * shared);
+    let parameters = [Parameter::FocalPx, Parameter::PinholeToGrating, Parameter::GratingToReference];
+    Some(Covariance {
+        parameters: parameters.map(|p| p.name().to_owned()).into(),
+        matrix: all.row_iter().map(|row| row.iter().copied().collect()).collect(),
+    })
 }
 
 fn observation(pair: PixelPair, minus: [f64; 2], plus: [f64; 2]) -> Observation {
@@ -156,18 +174,13 @@ fn height_on_axis(points: &[[f64; 3]]) -> Option<(f64, f64)> {
     Some((coefficients[0], (variance * inverse[(0, 0)]).sqrt()))
 }
 
-/// How the uncertainty of F and s carries over to the height on the axis, and with it to d.
-fn datum_sigma(found: &daic_optics::calibrate::Calibration, model: &OpticalModel, height_sigma: f64) -> f64 {
+/// Derivatives of the height on the axis by F and by s, at the pixels where it is seen.
+fn height_by(model: &OpticalModel) -> Option<[f64; 2]> {
     let axis = Vector3::zeros();
-    let pair = (model.project(daic_optics::View::Minus, axis), model.project(daic_optics::View::Plus, axis));
-    let (Ok(minus_px), Ok(plus_px)) = pair else { return f64::NAN };
-    let Ok(jacobian) = model.parameter_jacobian(Decoder::Ray, PixelPair { minus_px, plus_px }) else {
-        return f64::NAN;
-    };
-    let by = [Parameter::FocalPx, Parameter::PinholeToGrating].map(|p| jacobian.by(p)[2]);
-    let c = &found.covariance;
-    let carried = by[0] * by[0] * c[(0, 0)] + 2.0 * by[0] * by[1] * c[(0, 1)] + by[1] * by[1] * c[(1, 1)];
-    (carried.max(0.0) + height_sigma * height_sigma).sqrt()
+    let minus_px = model.project(daic_optics::View::Minus, axis).ok()?;
+    let plus_px = model.project(daic_optics::View::Plus, axis).ok()?;
+    let jacobian = model.parameter_jacobian(Decoder::Ray, PixelPair { minus_px, plus_px }).ok()?;
+    Some([Parameter::FocalPx, Parameter::PinholeToGrating].map(|p| jacobian.by(p)[2]))
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@
 //! absent, and belong to a key over settings and input: a second run does what the first left.
 
 mod calibration;
+mod microscope;
 mod report;
 mod summary;
 
@@ -14,13 +15,15 @@ pub use summary::{
 
 use crate::error::Error;
 use crate::expand;
-use crate::measure::{self, Displacement, Profile, Reference, spread};
+use crate::measure::{self, Displacement, Instrument, ObjectOptions, Profile, Reference, spread};
+use crate::optics_file::CalibratedOptics;
 use crate::optics_section;
 use crate::progress::Progress;
+use calibration::Calibrated;
 use daic_dataset::{Damage, Dataset, FrameRecord, FrameRole, Verdict, atomic, result_key};
 use daic_optics::{OpticalModel, Optics};
 use daic_protocol::program::Instruction;
-use daic_rig::experiment::{Experiment, OpticsFile};
+use daic_rig::experiment::{Covariance, Experiment, OpticsFile};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -54,11 +57,17 @@ pub struct Processed {
 
 /// Measures every paired frame of the dataset in `root`.
 ///
-/// `fresh` measures anew what has been measured already.
+/// `fresh` measures anew what has been measured already. With `optics` points are decoded with these, with their covariance,
+/// maps and volume, and nothing is calibrated.
 ///
 /// # Errors
 /// A dataset without paired frames, or anything that [`crate::Error`] names.
-pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Processed, Error> {
+pub fn process(
+    root: &Path,
+    fresh: bool,
+    optics: Option<&CalibratedOptics>,
+    progress: &dyn Progress,
+) -> Result<Processed, Error> {
     let dataset = Dataset::open(root)?;
     let experiment_path = root.join("experiment.toml");
     let experiment = Experiment::parse(&dataset.experiment_toml()?, &experiment_path)?;
@@ -69,7 +78,7 @@ pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Proc
     let reference_record = reference_of(&records)
         .ok_or_else(|| Error::NoPairedFrame { root: root.to_owned(), frames: records.len() })?;
 
-    let settings = crate::settings::measure_settings(&experiment.processing);
+    let settings = crate::settings::measure_settings(&experiment);
     let mut run = Run {
         dataset: &dataset,
         experiment: &experiment,
@@ -81,13 +90,32 @@ pub fn process(root: &Path, fresh: bool, progress: &dyn Progress) -> Result<Proc
         resumed: 0,
         failed: Vec::new(),
     };
-    let start = optics_section::from_section(&experiment.optics)?;
-    let (optics, calibration) = run.calibrated(&paired, &start)?;
-    write_optics(&dataset.results(), &experiment, &optics, calibration.as_ref())?;
-    let reference = run.profile(&optics)?;
+    let (source, calibration) = match (&experiment.microscope, optics) {
+        (Some(_), Some(optics)) => {
+            return Err(Error::NotForMicroscope { optics: optics.path().to_owned(), root: root.to_owned() });
+        }
+        (None, Some(optics)) => {
+            let decoder = crate::settings::decoder(experiment.processing.decoder);
+            let source =
+                Source::Stated { key: optics.key()?, instrument: Box::new(optics.instrument(decoder)?) };
+            (source, None)
+        }
+        (Some(_), None) => {
+            let (model, calibration) = run.calibrated_microscope(&paired)?;
+            (Source::Microscope(model), Some(calibration))
+        }
+        (None, None) => {
+            let section = optics_section::of(&experiment)?;
+            let calibrated = run.calibrated(&paired, &optics_section::from_section(section)?)?;
+            write_optics(&dataset.results(), section, &calibrated)?;
+            let summary = calibrated.summary.clone();
+            (Source::Macro(calibrated), summary)
+        }
+    };
+    let reference = run.profile(&source)?;
     let mut measured = Vec::new();
     for record in paired.iter().filter(|r| r.role == FrameRole::Measurement) {
-        match run.displacement(record, &optics) {
+        match run.displacement(record, &source) {
             Ok(result) => measured.push(result),
             // one bad frame does not stop a series
             Err(error @ (Error::Dataset(_) | Error::NothingMeasured { .. } | Error::Correlate(_))) => {
@@ -186,6 +214,33 @@ fn count(records: &[FrameRecord]) -> FrameCounts {
     }
 }
 
+/// What makes points of pixel pairs.
+enum Source {
+    /// Optics of the experiment, perhaps calibrated by the dataset's moves.
+    Macro(Calibrated),
+    /// An optics file.
+    Stated {
+        /// All of it that results depend on.
+        key: String,
+        /// Ready to decode.
+        instrument: Box<Instrument>,
+    },
+    /// A microscope, calibrated by the dataset's moves.
+    Microscope(crate::microscope::CalibratedModel),
+}
+
+impl Source {
+    /// All that its results depend on.
+    fn settings(&self) -> Result<serde_json::Value, Error> {
+        let value = match self {
+            Self::Macro(calibrated) => serde_json::to_value((&calibrated.optics, &calibrated.covariance)),
+            Self::Stated { key, .. } => serde_json::to_value(key),
+            Self::Microscope(model) => serde_json::to_value(model),
+        };
+        value.map_err(|source| Error::Unwritable { path: "key".into(), reason: source.to_string() })
+    }
+}
+
 struct Run<'a> {
     dataset: &'a Dataset,
     experiment: &'a Experiment,
@@ -205,6 +260,7 @@ struct StoredCalibration {
     key: String,
     summary: CalibrationSummary,
     optics: Optics,
+    covariance: Option<Covariance>,
 }
 
 impl Run<'_> {
@@ -213,21 +269,27 @@ impl Run<'_> {
     fn reference(&mut self) -> Result<&Reference, Error> {
         if self.reference.is_none() {
             let frame = self.dataset.read_frame(self.reference_record)?;
-            let model = OpticalModel::new(&optics_section::from_section(&self.experiment.optics)?)?;
-            self.reference = Some(Reference::new(&frame, &model, &self.settings, self.progress)?);
+            let found = if let Some(microscope) = &self.experiment.microscope {
+                Reference::by_outlines(&frame, microscope.search.px(), &self.settings, self.progress)?
+            } else {
+                let optics = optics_section::from_section(optics_section::of(self.experiment)?)?;
+                Reference::new(&frame, &OpticalModel::new(&optics)?, &self.settings, self.progress)?
+            };
+            self.reference = Some(found);
         }
         self.reference.as_ref().ok_or(Error::Gratings)
     }
 
-    fn key(&self, optics: &Optics, records: &[&FrameRecord]) -> Result<String, Error> {
+    fn key(&self, optics: &impl Serialize, records: &[&FrameRecord]) -> Result<String, Error> {
         let files: Vec<_> = records
             .iter()
             .filter_map(|r| Some(self.dataset.root().join(r.file.as_ref()?)))
             // a file that is gone has its own error where it is read
             .filter(|file| file.exists())
             .collect();
-        let settings =
-            (&self.experiment.processing, optics, records.iter().map(|r| r.commanded_um).collect::<Vec<_>>());
+        let commanded: Vec<_> = records.iter().map(|r| r.commanded_um).collect();
+        let bayer = self.experiment.rig.camera.bayer;
+        let settings = (&self.experiment.processing, optics, commanded, bayer);
         Ok(result_key(env!("CARGO_PKG_VERSION"), &settings, &files)?)
     }
 
@@ -237,18 +299,15 @@ impl Run<'_> {
         Some([0, 1, 2].map(|i| to[i] - from[i]))
     }
 
-    fn calibrated(
-        &mut self,
-        paired: &[&FrameRecord],
-        start: &Optics,
-    ) -> Result<(Optics, Option<CalibrationSummary>), Error> {
+    fn calibrated(&mut self, paired: &[&FrameRecord], start: &Optics) -> Result<Calibrated, Error> {
+        let as_stated = Calibrated { optics: *start, covariance: None, summary: None };
         let frames: Vec<(&FrameRecord, [f64; 3])> = paired
             .iter()
             .filter(|f| f.role == FrameRole::Calibration)
             .filter_map(|f| Some((*f, self.moved_um(f)?)))
             .collect();
         if frames.is_empty() || !self.experiment.processing.calibrate {
-            return Ok((*start, None));
+            return Ok(as_stated);
         }
         let mut inputs = vec![self.reference_record];
         inputs.extend(frames.iter().map(|f| f.0));
@@ -259,7 +318,8 @@ impl Run<'_> {
             && stored.key == key
         {
             self.resumed += 1;
-            return Ok((stored.optics, Some(stored.summary)));
+            let StoredCalibration { optics, covariance, summary, .. } = stored;
+            return Ok(Calibrated { optics, covariance, summary: Some(summary) });
         }
         let mut moved = Vec::new();
         for (record, move_um) in frames {
@@ -277,16 +337,34 @@ impl Run<'_> {
         }
         self.progress.stage("calibrating", 0);
         let axis_height_mm = self.experiment.processing.axis_height.mm();
-        let shared = calibration::shared_information(&self.settings);
+        let shared = self.settings.points_per_measurement();
         let matches = &self.reference()?.matches;
-        let (optics, summary) = calibration::run(start, matches, &moved, axis_height_mm, shared)?;
-        write_json(&path, &StoredCalibration { key, summary: summary.clone(), optics })?;
-        Ok((optics, Some(summary)))
+        let found = calibration::run(start, matches, &moved, axis_height_mm, shared)?;
+        if let Some(summary) = found.summary.clone() {
+            let covariance = found.covariance.clone();
+            write_json(&path, &StoredCalibration { key, summary, optics: found.optics, covariance })?;
+        }
+        Ok(found)
     }
 
-    fn profile(&mut self, optics: &Optics) -> Result<ReferenceResult, Error> {
+    fn instrument(&self, calibrated: &Calibrated) -> Result<Instrument, Error> {
+        let model = OpticalModel::new(&calibrated.optics)?;
+        let decoder = crate::settings::decoder(self.experiment.processing.decoder);
+        let mut instrument = Instrument::new(model, decoder);
+        let path = self.dataset.results().join("optics.toml");
+        if let Some(covariance) = &calibrated.covariance {
+            instrument.calibration = Some(optics_section::covariance_of(covariance, &path)?);
+        }
+        Ok(instrument)
+    }
+
+    fn object(&self) -> ObjectOptions {
+        ObjectOptions { step_mm: None, overlap: self.settings.overlap() }
+    }
+
+    fn profile(&mut self, source: &Source) -> Result<ReferenceResult, Error> {
         let record = self.reference_record;
-        let key = self.key(optics, &[record])?;
+        let key = self.key(&source.settings()?, &[record])?;
         let directory = self.dataset.frame_results(record.id);
         if !self.fresh
             && self.dataset.is_done(record.id, &key)
@@ -295,25 +373,39 @@ impl Run<'_> {
             self.resumed += 1;
             return Ok(done);
         }
-        let model = OpticalModel::new(optics)?;
-        let decoder = crate::settings::decoder(self.experiment.processing.decoder);
+        let (object, shared) = (self.object(), self.settings.points_per_measurement());
+        let profile = match source {
+            Source::Macro(calibrated) => {
+                let instrument = self.instrument(calibrated)?;
+                let reference = self.reference()?;
+                measure::profile(&reference.grid, &reference.matches, &instrument)
+            }
+            Source::Stated { instrument, .. } => {
+                let reference = self.reference()?;
+                measure::profile(&reference.grid, &reference.matches, instrument)
+            }
+            Source::Microscope(model) => {
+                let reference = self.reference()?;
+                crate::microscope::profile(&reference.grid, &reference.matches, &model.instrument()?)
+            }
+        }
+        .with_points()?;
         let reference = self.reference()?;
-        let profile = measure::profile(&reference.grid, &reference.matches, &model, decoder).with_points()?;
         let corners = |r: measure::Rectangle| [r.x, r.y, r.width, r.height];
         let result = ReferenceResult {
-            profile: profile_summary(&profile),
+            profile: profile_summary(&profile, shared),
             minus: corners(reference.minus),
             plus: corners(reference.plus),
         };
         let directory = self.dataset.begin_results(record.id)?;
-        measure::write_profile(&directory, &profile)?;
+        measure::write_profile(&directory, &profile, &object)?;
         write_json(&directory.join("result.json"), &result)?;
         self.dataset.mark_done(record.id, &key)?;
         Ok(result)
     }
 
-    fn displacement(&mut self, record: &FrameRecord, optics: &Optics) -> Result<FrameSummary, Error> {
-        let key = self.key(optics, &[self.reference_record, record])?;
+    fn displacement(&mut self, record: &FrameRecord, source: &Source) -> Result<FrameSummary, Error> {
+        let key = self.key(&source.settings()?, &[self.reference_record, record])?;
         let directory = self.dataset.frame_results(record.id);
         if !self.fresh
             && self.dataset.is_done(record.id, &key)
@@ -323,50 +415,63 @@ impl Run<'_> {
             return Ok(done);
         }
         let image = self.dataset.read_frame(record)?;
-        let model = OpticalModel::new(optics)?;
-        let decoder = crate::settings::decoder(self.experiment.processing.decoder);
+        let object = self.object();
         let commanded_um = self.moved_um(record);
         let (progress, settings) = (self.progress, self.settings.clone());
         let reference = self.reference()?;
         let tracks = reference.track(&image, progress)?;
-        let displacement = measure::displacement(
-            &reference.grid,
-            &reference.matches,
-            &tracks,
-            &model,
-            decoder,
-            settings.height_mm,
-        )
+        let displacement = match source {
+            Source::Macro(calibrated) => {
+                let instrument = self.instrument(calibrated)?;
+                let Reference { grid, matches, .. } = self.reference()?;
+                measure::displacement(grid, matches, &tracks, &instrument, settings.height_mm)
+            }
+            Source::Stated { instrument, .. } => {
+                let Reference { grid, matches, .. } = self.reference()?;
+                measure::displacement(grid, matches, &tracks, instrument, settings.height_mm)
+            }
+            Source::Microscope(model) => {
+                let Reference { grid, matches, .. } = self.reference()?;
+                crate::microscope::displacement(grid, matches, &tracks, &model.instrument()?)
+            }
+        }
         .with_points()?;
-        let result = frame_summary(record, commanded_um, &displacement);
+        let shared = settings.points_per_measurement();
+        let result = frame_summary(record, commanded_um, &displacement, shared);
         let directory = self.dataset.begin_results(record.id)?;
-        measure::write_displacement(&directory, &displacement)?;
+        measure::write_displacement(&directory, &displacement, None, &object)?;
         write_json(&directory.join("result.json"), &result)?;
         self.dataset.mark_done(record.id, &key)?;
         Ok(result)
     }
 }
 
-/// A profile in numbers.
-pub fn profile_summary(profile: &Profile) -> ProfileSummary {
+/// A profile in numbers; `shared` points have one independent measurement between them
+/// ([`measure::Settings::points_per_measurement`]).
+pub fn profile_summary(profile: &Profile, shared: f64) -> ProfileSummary {
     let ok = || profile.points.iter().filter(|p| p.status.is_ok());
     ProfileSummary {
         points: profile.points.len(),
         ok: ok().count(),
         mean_h_mm: spread(ok().map(|p| p.point_mm[2])).mean,
-        sigma_h_um: 1e3 * spread(ok().map(|p| p.sigma_mm[2])).rms,
-        mean_gap_um: 1e3 * profile.mean_gap_mm,
+        sigma_h_um: 1e3 * spread(ok().map(|p| p.sigma_mm()[2])).rms,
+        sigma_h_cal_um: profile.states_common.then(|| 1e3 * spread(ok().map(|p| p.common_sigma_mm()[2])).rms),
+        gap: profile.gap_summary(shared),
     }
 }
 
-/// A displacement field in numbers.
-pub fn field_summary(displacement: &Displacement) -> FieldSummary {
+/// A displacement field in numbers; `shared` as in [`profile_summary`].
+pub fn field_summary(displacement: &Displacement, shared: f64) -> FieldSummary {
     let ok = || displacement.points.iter().filter(|p| p.status.is_ok());
     let axis = |i: usize| spread(ok().map(|p| 1e3 * p.displacement_mm[i]));
     FieldSummary {
         measured_um: [0, 1, 2].map(|i| axis(i).mean),
         std_um: [0, 1, 2].map(|i| axis(i).std),
-        sigma_um: [0, 1, 2].map(|i| 1e3 * spread(ok().map(|p| p.sigma_mm[i])).rms),
+        sigma_um: [0, 1, 2].map(|i| 1e3 * spread(ok().map(|p| p.sigma_mm()[i])).rms),
+        sigma_cal_um: displacement
+            .states_common
+            .then(|| [0, 1, 2].map(|i| 1e3 * spread(ok().map(|p| p.common_sigma_mm()[i])).rms)),
+        gap: displacement.gap_summary(shared),
         points: displacement.points.len(),
         ok: ok().count(),
     }
@@ -376,6 +481,7 @@ fn frame_summary(
     record: &FrameRecord,
     commanded_um: Option<[f64; 3]>,
     displacement: &Displacement,
+    shared: f64,
 ) -> FrameSummary {
     let ok = || displacement.points.iter().filter(|p| p.status.is_ok());
     let against =
@@ -385,7 +491,7 @@ fn frame_summary(
         name: record.name.clone(),
         commanded_um,
         rms_um: commanded_um.map(against),
-        field: field_summary(displacement),
+        field: field_summary(displacement, shared),
     }
 }
 
@@ -420,20 +526,21 @@ fn run_begin(dataset: &Dataset) -> Result<Option<u64>, Error> {
 
 fn write_optics(
     directory: &Path,
-    experiment: &Experiment,
-    optics: &Optics,
-    calibration: Option<&CalibrationSummary>,
+    section: &daic_rig::experiment::Optics,
+    calibrated: &Calibrated,
 ) -> Result<(), Error> {
-    let provenance = calibration.map_or_else(
+    let provenance = calibrated.summary.as_ref().map_or_else(
         || "as in the experiment file, not calibrated".to_owned(),
         |c| format!("focal, distances calibrated from {} points, residual {:.4} px RMS", c.points, c.rms_px),
     );
     let file = OpticsFile {
         format: Some(OpticsFile::FORMAT.to_owned()),
         provenance: Some(provenance),
-        date: None,
-        covariance: None,
-        optics: optics_section::with_calibrated(&experiment.optics, optics),
+        date: Some(crate::camera_file::now()),
+        covariance: calibrated.covariance.clone(),
+        maps: None,
+        volume: None,
+        optics: optics_section::with_calibrated(section, &calibrated.optics),
     };
     let path = directory.join("optics.toml");
     let text = file

@@ -35,6 +35,7 @@ pub fn report(
         });
     }
     let height = FloatMap::read_tiff(&dataset.frame_results(reference_record.id).join("h_mm.tif"))?;
+    let gap = FloatMap::read_tiff(&dataset.frame_results(reference_record.id).join("gap_mm.tif"))?;
     figures::write_surface_svg(
         &dataset.results().join(super::FIGURES).join("surface.svg"),
         &height,
@@ -62,13 +63,19 @@ pub fn report(
     }
     sections.push(Section {
         title: "Shape of the reference".to_owned(),
-        text: vec![format!(
-            "{} of {} points; σ of a single height {}, mean gap of the two rays {}.",
-            summary.profile.ok,
-            summary.profile.points,
-            plain(summary.profile.sigma_h_um, 2, "µm"),
-            plain(summary.profile.mean_gap_um, 2, "µm"),
-        )],
+        text: vec![
+            format!(
+                "{} of {} points; σ of a single height {} from the match{}.",
+                summary.profile.ok,
+                summary.profile.points,
+                plain(summary.profile.sigma_h_um, 2, "µm"),
+                summary.profile.sigma_h_cal_um.map_or_else(String::new, |cal| format!(
+                    ", {} from the calibration, in common for all points",
+                    plain(cal, 2, "µm")
+                )),
+            ),
+            summary.profile.gap.verdict(),
+        ],
         tables: Vec::new(),
         figures: vec![
             figures::map_figure(
@@ -79,6 +86,7 @@ pub fn report(
                 "Height towards the camera over the reference plane.",
             )?,
             figures::surface_figure(&height, "Surface", "Drag to turn, scroll to zoom.")?,
+            figures::map_figure(&gap, "Gap of the two rays", "gap", Unit::Micrometre, figures::GAP_CAPTION)?,
         ],
     });
     let frame = dataset.read_frame(reference_record)?;
@@ -112,9 +120,15 @@ pub fn report(
         sections.push(Section {
             title: "Calibration".to_owned(),
             text: vec![
-                "F and s follow from the commanded moves; d, which only says from where heights are counted, \
-                 from the height of the specimen on the optical axis that the experiment states."
-                    .to_owned(),
+                if experiment.microscope.is_some() {
+                    "β and the centre of perspective follow from the commanded moves, by least squares in image \
+                     space. Heights count from the mean of the reference surface. All residuals: \
+                     results/calibration/report.html."
+                } else {
+                    "F and s follow from the commanded moves; d, which only says from where heights are \
+                     counted, from the height of the specimen on the optical axis that the experiment states."
+                }
+                .to_owned(),
             ],
             tables: vec![table],
             figures: Vec::new(),
@@ -206,7 +220,7 @@ fn calibration_table(summary: &Summary) -> Option<TableBlock> {
         .map(|p| {
             vec![
                 Cell::Text(p.name.clone()),
-                Cell::Number(format!("{:.4}", p.start)),
+                Cell::Number(p.start.map_or_else(|| "—".to_owned(), |v| format!("{v:.4}"))),
                 Cell::Number(with_uncertainty(p.value, p.sigma, "")),
             ]
         })

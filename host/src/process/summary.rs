@@ -1,5 +1,6 @@
 //! `summary.json`: what a dataset says, in numbers.
 
+use crate::measure::GapSummary;
 use serde::{Deserialize, Serialize};
 
 /// Everything measured in a dataset. Lengths in micrometres unless the name says otherwise; axes x
@@ -84,8 +85,8 @@ pub struct CalibrationSummary {
 pub struct CalibratedParameter {
     /// Name with unit.
     pub name: String,
-    /// What the experiment file said.
-    pub start: f64,
+    /// What the experiment file said, if it did.
+    pub start: Option<f64>,
     /// Estimate.
     pub value: f64,
     /// Its standard deviation.
@@ -103,8 +104,10 @@ pub struct ProfileSummary {
     pub mean_h_mm: f64,
     /// RMS of the points' own σ_h in micrometres.
     pub sigma_h_um: f64,
-    /// Mean distance of the two rays in micrometres.
-    pub mean_gap_um: f64,
+    /// RMS of the points' σ_h from the calibration in micrometres; none where nothing is known of it.
+    pub sigma_h_cal_um: Option<f64>,
+    /// Gap of the two rays: whether the calibration fits the frame.
+    pub gap: GapSummary,
 }
 
 /// A measured frame in numbers.
@@ -132,6 +135,10 @@ pub struct FieldSummary {
     pub std_um: [f64; 3],
     /// RMS of the points' own standard deviations.
     pub sigma_um: [f64; 3],
+    /// RMS of the points' standard deviations from the calibration; none where nothing is known of it.
+    pub sigma_cal_um: Option<[f64; 3]>,
+    /// Gap of the two rays of the reference: whether the calibration fits the frame.
+    pub gap: GapSummary,
     /// Points of the grid.
     pub points: usize,
     /// Points with a result.

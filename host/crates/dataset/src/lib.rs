@@ -11,6 +11,7 @@
 pub mod atomic;
 pub mod dataset;
 pub mod image_file;
+mod lattice;
 pub mod map;
 mod npz;
 pub mod table;
@@ -21,6 +22,7 @@ pub use dataset::{
     Recording, StrobeRecord, Verdict, result_key,
 };
 pub use image_file::{GreyImage, ImageFileError, ReadNote, read_grey};
+pub use lattice::Lattice;
 pub use map::{FloatMap, MapAxes, MapError};
 pub use npz::NpzError;
 pub use table::{Column, Table, TableError};

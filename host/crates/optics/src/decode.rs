@@ -1,11 +1,11 @@
 //! From a pixel pair to a point, by three models behind one interface.
 
-use nalgebra::{Matrix3, Matrix3x4, Matrix4, SMatrix, Vector3};
+use nalgebra::{Matrix3, Matrix3x4, Matrix4, RowVector4, SMatrix, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::model::{OpticalModel, Paraxial, Setup, TraceError};
 use crate::parameter::{ParameterCovariance, ParameterJacobian};
-use crate::real::{Dual, Real, along, dot, sub};
+use crate::real::{Dual, Real, along, cross, dot, sub};
 use crate::setup::View;
 
 /// How a pixel pair becomes a point.
@@ -62,9 +62,12 @@ pub fn pixel_covariance(sigma_minus_px: [f64; 2], sigma_plus_px: [f64; 2]) -> Ma
 pub struct Decoded {
     /// (x, y, h) in millimetres.
     pub point_mm: Vector3<f64>,
-    /// How far the pair is from meeting, ≥ 0: for [`Decoder::Ray`] the shortest distance of the
-    /// two lines of sight; for the virtual-object models |v| on the scale of the object.
+    /// How far the pair is from meeting: for [`Decoder::Ray`] the shortest distance of the two lines of
+    /// sight; for the virtual-object models v on the scale of the object. Above 0 where the +1 view's
+    /// passes at larger y.
     pub gap_mm: f64,
+    /// ∂gap/∂(x₋, y₋, x₊, y₊), mm/px.
+    pub gap_jacobian: RowVector4<f64>,
     /// ∂(x, y, h)/∂(x₋, y₋, x₊, y₊), mm/px.
     pub jacobian: Matrix3x4<f64>,
 }
@@ -73,6 +76,11 @@ impl Decoded {
     /// Covariance (mm²) of the point from that of the four pixel coordinates (px²).
     pub fn covariance_mm2(&self, pixels: &Matrix4<f64>) -> Matrix3<f64> {
         self.jacobian * pixels * self.jacobian.transpose()
+    }
+
+    /// Variance (mm²) of the gap from the covariance of the four pixel coordinates (px²).
+    pub fn gap_variance_mm2(&self, pixels: &Matrix4<f64>) -> f64 {
+        (self.gap_jacobian * pixels * self.gap_jacobian.transpose())[0]
     }
 }
 
@@ -86,6 +94,10 @@ pub struct UncertainPoint {
     /// Covariance (mm²) from the calibration, shared with all other points:
     /// [`ParameterCovariance::between`] gives it between two.
     pub common_mm2: Matrix3<f64>,
+    /// Variance (mm²) of the gap from the pixels.
+    pub gap_independent_mm2: f64,
+    /// Variance (mm²) of the gap from the calibration.
+    pub gap_common_mm2: f64,
 }
 
 impl UncertainPoint {
@@ -137,10 +149,11 @@ impl OpticalModel {
     pub fn decode(&self, decoder: Decoder, pair: PixelPair) -> Result<Decoded, TraceError> {
         let c = pair.coordinates();
         let v = |i: usize| Dual::<4>::variable(c[i], i);
-        let (p, gap_mm) = decode(&self.by_pair, decoder, [v(0), v(1)], [v(2), v(3)])?;
+        let (p, gap) = decode(&self.by_pair, decoder, [v(0), v(1)], [v(2), v(3)])?;
         Ok(Decoded {
             point_mm: p.map(|p| p.value).into(),
-            gap_mm,
+            gap_mm: gap.value,
+            gap_jacobian: gap.gradient.into(),
             jacobian: Matrix3x4::from_fn(|i, j| p[i].gradient[j]),
         })
     }
@@ -164,9 +177,20 @@ impl OpticalModel {
         decoder: Decoder,
         pair: PixelPair,
     ) -> Result<ParameterJacobian<3>, TraceError> {
+        let all = self.point_and_gap_by_parameters(decoder, pair)?;
+        Ok(ParameterJacobian(all.0.fixed_rows::<3>(0).into_owned()))
+    }
+
+    /// Derivatives of (x, y, h, gap) with respect to every parameter.
+    fn point_and_gap_by_parameters(
+        &self,
+        decoder: Decoder,
+        pair: PixelPair,
+    ) -> Result<ParameterJacobian<4>, TraceError> {
         let constant = |p: [f64; 2]| p.map(Dual::constant);
-        let (p, _) = decode(&self.by_parameters, decoder, constant(pair.minus_px), constant(pair.plus_px))?;
-        Ok(ParameterJacobian(SMatrix::from_fn(|i, j| p[i].gradient[j])))
+        let (p, gap) = decode(&self.by_parameters, decoder, constant(pair.minus_px), constant(pair.plus_px))?;
+        let rows = [p[0], p[1], p[2], gap];
+        Ok(ParameterJacobian(SMatrix::from_fn(|i, j| rows[i].gradient[j])))
     }
 
     /// The point with its covariance in two parts: what the pixels' noise does to this point
@@ -182,13 +206,19 @@ impl OpticalModel {
         calibration: &ParameterCovariance,
     ) -> Result<UncertainPoint, TraceError> {
         let decoded = self.decode(decoder, pair)?;
-        let common_mm2 = if calibration.parameters().is_empty() {
-            Matrix3::zeros()
+        let common = if calibration.parameters().is_empty() {
+            Matrix4::zeros()
         } else {
-            let by = self.parameter_jacobian(decoder, pair)?;
+            let by = self.point_and_gap_by_parameters(decoder, pair)?;
             calibration.between(&by, &by)
         };
-        Ok(UncertainPoint { independent_mm2: decoded.covariance_mm2(pixels_px2), common_mm2, decoded })
+        Ok(UncertainPoint {
+            independent_mm2: decoded.covariance_mm2(pixels_px2),
+            common_mm2: common.fixed_view::<3, 3>(0, 0).into_owned(),
+            gap_independent_mm2: decoded.gap_variance_mm2(pixels_px2),
+            gap_common_mm2: common[(3, 3)],
+            decoded,
+        })
     }
 
     /// Displacement of a material point tracked in both views.
@@ -219,22 +249,25 @@ fn decode<T: Real>(
     decoder: Decoder,
     minus: [T; 2],
     plus: [T; 2],
-) -> Result<([T; 3], f64), TraceError> {
+) -> Result<([T; 3], T), TraceError> {
     let finite = |p: [T; 2]| p.iter().all(|c| c.value().is_finite());
     if !(finite(minus) && finite(plus)) {
         return Err(TraceError::NotFinite);
     }
     let minus = setup.direction(View::Minus, minus)?;
     let plus = setup.direction(View::Plus, plus)?;
-    match decoder {
-        Decoder::Ray => by_rays(setup, minus, plus),
+    let (point, gap) = match decoder {
+        Decoder::Ray => by_rays(setup, minus, plus)?,
         Decoder::Closed | Decoder::Linear => {
-            by_virtual_object(setup, decoder == Decoder::Linear, minus, plus)
+            by_virtual_object(setup, decoder == Decoder::Linear, minus, plus)?
         }
-    }
+    };
+    // distances near the largest number have squares beyond it
+    let finite = point.iter().all(|c| c.value().is_finite()) && gap.value().is_finite();
+    if finite { Ok((point, gap)) } else { Err(TraceError::NotFinite) }
 }
 
-fn by_rays<T: Real>(setup: &Setup<T>, minus: [T; 2], plus: [T; 2]) -> Result<([T; 3], f64), TraceError> {
+fn by_rays<T: Real>(setup: &Setup<T>, minus: [T; 2], plus: [T; 2]) -> Result<([T; 3], T), TraceError> {
     let a = setup.trace(View::Minus, minus)?;
     let b = setup.trace(View::Plus, plus)?;
     // Lines a + s·da and b + t·db with unit directions; the shortest segment is normal to both.
@@ -255,8 +288,9 @@ fn by_rays<T: Real>(setup: &Setup<T>, minus: [T; 2], plus: [T; 2]) -> Result<([T
             return Err(TraceError::BeforeGrating { distance_mm });
         }
     }
-    let gap = sub(on_a, on_b).map(T::value);
-    Ok((setup.object(middle), dot(gap, gap).sqrt()))
+    // Both lines lean towards each other along x, so the normal of both points along −y.
+    let normal = cross(a.direction, b.direction);
+    Ok((setup.object(middle), dot(w, normal) / dot(normal, normal).sqrt()))
 }
 
 /// The paraxial models, with pixels already free of distortion and divided by F.
@@ -265,7 +299,7 @@ fn by_virtual_object<T: Real>(
     linear: bool,
     minus: [T; 2],
     plus: [T; 2],
-) -> Result<([T; 3], f64), TraceError> {
+) -> Result<([T; 3], T), TraceError> {
     let one = T::constant(1.0);
     let half = T::constant(0.5);
     let Paraxial { s, d, sin_theta: sin } = setup.paraxial;
@@ -290,7 +324,6 @@ fn by_virtual_object<T: Real>(
     if !(distance_mm > 0.0) {
         return Err(TraceError::BeforeGrating { distance_mm });
     }
-    let gap = (v * scale).value().abs();
     let world = [middle[0] * scale, middle[1] * scale, s + d - h];
-    Ok((setup.object(world), gap))
+    Ok((setup.object(world), v * scale))
 }

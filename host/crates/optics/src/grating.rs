@@ -8,7 +8,7 @@
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::real::{Real, dot};
+use crate::real::{Real, along, dot};
 
 /// On which side of the grooves the substrate lies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -214,6 +214,31 @@ impl<T: Real> Axes<T> {
             return Err(NoOrder::Evanescent { across: a.value(), along: b.value() });
         }
         Ok(Cosines { before, after: [a, b, c2.sqrt()] })
+    }
+
+    /// Where a ray that crosses the plane of the grooves at `origin` seems to cross it because of the plate
+    /// that carries them.
+    ///
+    /// Snell's law keeps the tangential cosines; the plate is passed at a steeper angle and shifts the ray
+    /// along the grating. One shift serves both sides: before the grooves it moves where they are hit, behind
+    /// them where the ray seems to come from.
+    #[inline]
+    pub(crate) fn past_plate(
+        &self,
+        origin: [T; 3],
+        cosines: &Cosines<T>,
+        side: SubstrateSide,
+        thickness: T,
+        index: T,
+    ) -> [T; 3] {
+        let c = match side {
+            SubstrateSide::Camera => cosines.before,
+            SubstrateSide::Object => cosines.after,
+        };
+        let one = T::constant(1.0);
+        let inside = (index * index - c[0] * c[0] - c[1] * c[1]).sqrt();
+        let t = thickness * (one / inside - one / c[2]);
+        along(along(origin, self.across, c[0] * t), self.along, c[1] * t)
     }
 
     #[inline]

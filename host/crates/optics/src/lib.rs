@@ -22,7 +22,8 @@
 //! ([`OpticalModel::displacement`]), the expected disparity ([`OpticalModel::disparity_range`]).
 //! Dense distortion maps ([`maps`]) may stand in for the camera's Brown terms or on top of them.
 //! [`calibrate`](calibrate::calibrate) estimates F and the distances from points tracked through
-//! known moves, [`bundle`] everything from views of a plate in several poses.
+//! known moves, [`bundle`] everything from views of a plate in several poses, [`distortion`] maps of the image
+//! distortion from phases of a line target.
 //! [`microscope`] holds the same for the microscope. What both are is [`PairModel`]. [`plan`](mod@plan) says what a
 //! set-up will be able to measure; [`surface`] is the strain on a measured surface.
 //! [`target`] finds calibration boards in images, [`intrinsics`] calibrates a camera from them,
@@ -39,6 +40,7 @@ pub mod bundle;
 pub mod calibrate;
 pub mod camera;
 pub mod decode;
+pub mod distortion;
 pub mod grating;
 pub mod intrinsics;
 pub mod maps;
@@ -59,12 +61,17 @@ pub use bundle::{Component, RigCalibration, RigData, RigError, RigSettings, cali
 pub use calibrate::{CalibrateError, Calibration, Estimate, Observation, Settings, TrackedPoint, calibrate};
 pub use camera::{Brown, Camera, UndistortError};
 pub use decode::{Decoded, Decoder, Displacement, PixelPair, UncertainPoint, pixel_covariance};
+pub use distortion::{
+    DistortionCalibration, DistortionError, DistortionWarning, TargetPhase, TargetPhases, TargetPose,
+    calibrate_distortion,
+};
 pub use grating::{DiffractError, Grating, GratingFrame, Substrate, SubstrateSide};
 pub use maps::{DistortionMap, DistortionMaps, MapError, MapFit, MapGrid, MapSample};
 pub use model::{OpticalModel, Ray, TraceError};
 pub use pair_model::PairModel;
 pub use parameter::{
-    CovarianceError, GratingParameter, Parameter, ParameterCovariance, ParameterJacobian, UnknownParameter,
+    CovarianceError, GratingParameter, LEAST_EIGENVALUE, Parameter, ParameterCovariance, ParameterJacobian,
+    UnknownParameter, least_correlation_eigenvalue,
 };
 pub use patch::{GreyError, GreyView};
 pub use project::DisparityRange;

@@ -54,6 +54,14 @@ impl MapGrid {
         })
     }
 
+    /// The node nearest to a pixel, row by row, or nothing outside the grid.
+    pub fn nearest(&self, pixel_px: [f64; 2]) -> Option<usize> {
+        let place =
+            |i: usize| ((pixel_px[i] - self.origin_px[i]) / self.step_px[i]).round().max(0.0) as usize;
+        self.contains(pixel_px)
+            .then(|| place(1).min(self.nodes[1] - 1) * self.nodes[0] + place(0).min(self.nodes[0] - 1))
+    }
+
     fn coefficients(&self) -> [usize; 2] {
         self.nodes.map(|n| n + 2)
     }
@@ -144,6 +152,41 @@ impl MapFit {
     pub fn sigma_px(&self, pixel_px: [f64; 2]) -> Option<f64> {
         let grid = &self.map.grid;
         grid.contains(pixel_px).then(|| self.factor.variance(&basis(grid, pixel_px)).sqrt())
+    }
+
+    /// How the map at a pixel of the grid depends on the samples.
+    pub(crate) fn influence(&self, pixel_px: [f64; 2]) -> Influence<'_> {
+        let grid = &self.map.grid;
+        let [nx, ny] = grid.coefficients();
+        let mut row = vec![0.0; nx * ny];
+        let basis = basis(grid, pixel_px);
+        for (a, v) in basis {
+            row[a] += v;
+        }
+        let by_coefficient = self.factor.solve(row);
+        let variance = basis.iter().map(|(a, v)| v * by_coefficient[*a]).sum();
+        Influence { grid, by_coefficient, variance }
+    }
+}
+
+/// How a fitted map at one pixel depends on the samples.
+pub(crate) struct Influence<'a> {
+    grid: &'a MapGrid,
+    by_coefficient: Vec<f64>,
+    variance: f64,
+}
+
+impl Influence<'_> {
+    /// Square of [`MapFit::sigma_px`].
+    pub(crate) fn variance(&self) -> f64 {
+        self.variance
+    }
+
+    /// Change of the map per change of the sample's value.
+    pub(crate) fn weight(&self, sample: &MapSample) -> f64 {
+        let sum: f64 =
+            basis(self.grid, sample.pixel_px).iter().map(|(a, v)| v * self.by_coefficient[*a]).sum();
+        sum / (sample.sigma_px * sample.sigma_px)
     }
 }
 

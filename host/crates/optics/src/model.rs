@@ -213,18 +213,7 @@ impl<T: Real> Setup<T> {
         let to_plane = g.distance * g.axes.normal[2] / cosines.before[2];
         let mut origin = [k[0] * to_plane, k[1] * to_plane, k[2] * to_plane];
         if let Some(plate) = &g.plate {
-            // Snell's law keeps the tangential cosines; the plate is passed at a steeper angle
-            // and shifts the ray along the grating. One shift serves both sides: before the
-            // grooves it moves where they are hit, behind them where the ray seems to come from.
-            let c = match g.side {
-                SubstrateSide::Camera => cosines.before,
-                SubstrateSide::Object => cosines.after,
-            };
-            let n = plate.index;
-            let inside = (n * n - c[0] * c[0] - c[1] * c[1]).sqrt();
-            let t = plate.thickness * (one / inside - one / c[2]);
-            origin = along(origin, g.axes.across, c[0] * t);
-            origin = along(origin, g.axes.along, c[1] * t);
+            origin = g.axes.past_plate(origin, &cosines, g.side, plate.thickness, plate.index);
         }
         Ok(WorldRay { origin, direction: g.axes.to_world(cosines.after) })
     }

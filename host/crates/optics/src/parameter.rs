@@ -1,6 +1,6 @@
 //! The quantities of a set-up that can be estimated or carry an uncertainty.
 
-use nalgebra::{DMatrix, Matrix3, SMatrix, Vector3};
+use nalgebra::{DMatrix, SMatrix, SVector, SymmetricEigen};
 use serde::{Deserialize, Serialize};
 
 use crate::setup::{Optics, View};
@@ -299,7 +299,7 @@ pub struct ParameterJacobian<const R: usize>(pub SMatrix<f64, R, { Parameter::CO
 
 impl<const R: usize> ParameterJacobian<R> {
     /// Derivatives with respect to one parameter, per unit of its field.
-    pub fn by(&self, parameter: Parameter) -> nalgebra::SVector<f64, R> {
+    pub fn by(&self, parameter: Parameter) -> SVector<f64, R> {
         self.0.column(parameter.index()).into_owned()
     }
 }
@@ -345,7 +345,35 @@ pub enum CovarianceError {
         /// The value.
         value: f64,
     },
+    /// Every pair fits, all together do not: some combination of the parameters would have a negative variance.
+    #[error(
+        "the covariance is of no possible errors: the smallest eigenvalue of its correlations is {eigenvalue}, it must not be below 0"
+    )]
+    Negative {
+        /// Smallest eigenvalue of the matrix of correlations.
+        eigenvalue: f64,
+    },
 }
+
+/// Smallest eigenvalue of the correlations of a symmetric matrix with a diagonal that is not below 0; 0 for a matrix
+/// without entries. A covariance has none below 0 but for rounding ([`LEAST_EIGENVALUE`]).
+pub fn least_correlation_eigenvalue(covariance: &DMatrix<f64>) -> f64 {
+    let n = covariance.nrows();
+    let correlation = DMatrix::from_fn(n, n, |i, j| {
+        let unit = (covariance[(i, i)] * covariance[(j, j)]).sqrt();
+        if i == j {
+            1.0
+        } else if unit > 0.0 {
+            covariance[(i, j)] / unit
+        } else {
+            0.0
+        }
+    });
+    if n == 0 { 0.0 } else { SymmetricEigen::new(correlation).eigenvalues.min() }
+}
+
+/// As far below 0 as rounding may bring the smallest eigenvalue of correlations written with 17 digits.
+pub const LEAST_EIGENVALUE: f64 = -1e-9;
 
 impl ParameterCovariance {
     /// Nothing uncertain.
@@ -378,6 +406,10 @@ impl ParameterCovariance {
                 }
             }
         }
+        let eigenvalue = least_correlation_eigenvalue(&matrix);
+        if eigenvalue < LEAST_EIGENVALUE {
+            return Err(CovarianceError::Negative { eigenvalue });
+        }
         Ok(Self { parameters, matrix })
     }
 
@@ -406,16 +438,20 @@ impl ParameterCovariance {
         self.parameters.iter().position(|p| *p == parameter).map_or(0.0, |i| self.matrix[(i, i)].sqrt())
     }
 
-    /// Covariance (mm²) that it causes between two points with these derivatives; the covariance of
-    /// one point where both are the same.
-    pub fn between(&self, a: &ParameterJacobian<3>, b: &ParameterJacobian<3>) -> Matrix3<f64> {
-        let by = |j: &ParameterJacobian<3>| -> Vec<Vector3<f64>> {
+    /// Covariance that it causes between two quantities with these derivatives, two points (mm²) for
+    /// instance; the covariance of one where both are the same.
+    pub fn between<const R: usize>(
+        &self,
+        a: &ParameterJacobian<R>,
+        b: &ParameterJacobian<R>,
+    ) -> SMatrix<f64, R, R> {
+        let by = |j: &ParameterJacobian<R>| -> Vec<SVector<f64, R>> {
             self.parameters.iter().map(|p| j.by(*p)).collect()
         };
         let (a, b) = (by(a), by(b));
-        let mut sum = Matrix3::zeros();
+        let mut sum = SMatrix::zeros();
         for (i, a) in a.iter().enumerate() {
-            let mut row = Vector3::zeros();
+            let mut row = SVector::zeros();
             for (j, b) in b.iter().enumerate() {
                 row += b * self.matrix[(i, j)];
             }

@@ -48,7 +48,7 @@ fn ray_recovers_points_of_the_independent_tracer() {
         for p in field(wavy) {
             let d = m.decode(Decoder::Ray, see_both(&o, p)).unwrap();
             worst = worst.max((d.point_mm - p).amax());
-            gap = gap.max(d.gap_mm);
+            gap = gap.max(d.gap_mm.abs());
         }
         println!("{name}: worst {worst:.1e} mm, gap {gap:.1e} mm");
         assert!(worst < 1e-12 && gap < 1e-12, "{name}: {worst:e} {gap:e}");
@@ -519,7 +519,7 @@ fn extreme_input_never_panics() {
             if let Ok(d) = m.decode(decoder, pair) {
                 decoded += 1;
                 assert!(d.point_mm.iter().all(|c| c.is_finite()), "{pair:?} {d:?}");
-                assert!(d.gap_mm >= 0.0);
+                assert!(d.gap_mm.is_finite());
             }
             let _ = m.parameter_jacobian(decoder, pair);
         }

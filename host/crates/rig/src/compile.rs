@@ -375,7 +375,7 @@ impl<'a> Emitter<'a> {
             edge(mask, value, after, nodes);
             now = tick;
         }
-        let busy = [section.exposure_delay, section.exposure, section.readout]
+        let busy = [section.exposure_delay, section.exposure, section.rolling(), section.readout]
             .iter()
             .fold(0u64, |sum, &time| sum.saturating_add(self.ticks(time)));
         delay(busy.saturating_sub(now), nodes);

@@ -46,8 +46,9 @@ fn the_template_is_valid_and_describes_the_demo() {
     let last =
         e.sequence.iter().rev().find_map(|s| if let Step::Move(m) = s { Some(m.targets()) } else { None });
     assert_eq!(last, Some([0.05, -0.03, 0.2].map(|mm| Some(Length::new(mm)))));
-    assert_eq!(e.optics.wavelength.mm(), 0.000633);
-    assert_eq!(e.optics.gratings().map(|g| g.map(|g| g.pitch_mm())), Some([Some(1.0 / 300.0); 2]));
+    let optics = e.optics.as_ref().expect("optics");
+    assert_eq!(optics.wavelength.mm(), 0.000633);
+    assert_eq!(optics.gratings().map(|g| g.map(|g| g.pitch_mm())), Some([Some(1.0 / 300.0); 2]));
 }
 
 #[test]
@@ -62,7 +63,8 @@ fn what_is_commented_out_in_the_template_is_valid_too() {
         text.push('\n');
     }
     let e = parse(&text).unwrap_or_else(|e| panic!("{e}\n{text}"));
-    assert!(e.optics.brown.is_some() && e.processing.noise == Some(2.0) && e.processing.roi.is_some());
+    assert!(e.optics.as_ref().is_some_and(|o| o.brown.is_some()));
+    assert!(e.processing.noise == Some(2.0) && e.processing.roi.is_some());
     assert!(matches!(e.sequence.last(), Some(Step::Repeat(r)) if r.times == 20 && r.steps.len() == 2));
 }
 
@@ -266,7 +268,7 @@ fn the_golden_optics_fit_what_the_golden_frames_state() {
 fn optics_files_read_back_to_the_same_bits_and_refuse_other_formats() {
     let path = Path::new("optics.toml");
     let whole = OpticsFile::parse(template(), path).expect("an experiment will do");
-    assert_eq!(whole.optics, parse(template()).expect("template").optics);
+    assert_eq!(Some(whole.optics.clone()), parse(template()).expect("template").optics);
     let mut file = OpticsFile {
         format: Some(OpticsFile::FORMAT.to_owned()),
         provenance: Some("test".to_owned()),
@@ -349,4 +351,74 @@ proptest::proptest! {
             assert!(length.mm().is_finite());
         }
     }
+}
+
+#[test]
+fn the_microscope_template_is_valid_and_needs_no_optics() {
+    let text = daic_rig::experiment::microscope_template();
+    let e = parse(text).expect("valid");
+    let microscope = e.microscope.as_ref().expect("a microscope");
+    assert_eq!((microscope.pixel.mm(), microscope.search.px()), (0.5e-3, 40.0));
+    assert!(e.optics.is_none());
+    let error = OpticsFile::parse(text, Path::new("scope.toml")).expect_err("no optics").to_string();
+    assert!(error.contains("scope.toml") && error.contains("microscope"), "{error}");
+    let both = format!("{}\n{text}", "[optics]\nwavelength = \"633 nm\"\npinhole_to_grating = \"307 mm\"\ngrating_to_reference = \"109 mm\"\nfocal = \"17000 px\"\nprincipal_point = [\"1 px\", \"1 px\"]\ngrating = { lines = \"300 /mm\" }\n").replacen("seed = 1\n", "", 1);
+    for (text, words) in [
+        (both, "one of [optics] and [microscope]"),
+        (text.replace("[microscope]", "[other]"), "other"),
+        (text.replace("\"40 px\"", "\"0 px\""), "microscope.search"),
+    ] {
+        let error = parse(&text).expect_err(words).to_string();
+        assert!(error.contains(words), "{words}: {error}");
+    }
+}
+
+/// Where the channel's first pixel lies in the cell, written out for every pattern and channel.
+#[test]
+fn bayer_channels_lie_where_the_pattern_says() {
+    use daic_rig::experiment::Bayer;
+    for (text, origin) in [
+        ("rggb:r", [0, 0]),
+        ("rggb:gr", [1, 0]),
+        ("rggb:gb", [0, 1]),
+        ("rggb:b", [1, 1]),
+        ("grbg:r", [1, 0]),
+        ("grbg:gr", [0, 0]),
+        ("grbg:gb", [1, 1]),
+        ("grbg:b", [0, 1]),
+        ("gbrg:r", [0, 1]),
+        ("gbrg:gr", [1, 1]),
+        ("gbrg:gb", [0, 0]),
+        ("gbrg:b", [1, 0]),
+        ("bggr:r", [1, 1]),
+        ("bggr:gr", [0, 1]),
+        ("bggr:gb", [1, 0]),
+        ("bggr:b", [0, 0]),
+    ] {
+        assert_eq!(text.parse::<Bayer>().expect(text).origin(), origin, "{text}");
+    }
+    for wrong in ["rggb", "rggb:g", "rgbg:r", ""] {
+        assert!(wrong.parse::<Bayer>().expect_err(wrong).contains("rggb:r"));
+    }
+    let line = "bayer = { pattern = \"grbg\", channel = \"gb\" }\n";
+    let text = template().replace("readout = \"35 ms\"", &format!("{line}readout = \"35 ms\""));
+    assert_eq!(parse(&text).expect("valid").rig.camera.bayer.map(Bayer::origin), Some([1, 1]));
+}
+
+/// With a rolling shutter the strobe must lie where all rows are exposed: 1944 rows of 2 µs leave 3.886 ms of 5 ms.
+#[test]
+fn a_strobe_that_misses_rows_is_refused() {
+    let with = |row: &str, delay: &str| {
+        let text = template()
+            .replace("readout = \"35 ms\"", &format!("row_time = \"{row}\"\nreadout = \"35 ms\""))
+            .replace("delay = \"1 ms\"", &format!("delay = \"{delay}\""));
+        parse(&text)
+    };
+    assert!(with("0.5 us", "1 ms").is_ok());
+    let error = with("2 us", "1 ms").expect_err("rows are missed").to_string();
+    assert!(error.contains("rig.strobe.delay") && error.contains("rolling shutter"), "{error}");
+    assert!(with("2 us", "3.9 ms").is_ok());
+    assert!(with("2 us", "4.9 ms").is_err());
+    assert!(with("-1 us", "1 ms").is_err());
+    assert_eq!(with("2 us", "3.9 ms").expect("valid").rig.camera.rolling().ns(), 1943.0 * 2000.0);
 }

@@ -170,3 +170,20 @@ fn list(combination: &[Component]) -> String {
         combination.iter().map(|c| format!("{:+.2}·{}", c.weight, c.parameter.name())).collect();
     terms.join(" ")
 }
+
+impl RigError {
+    /// The pose and the point that are to blame, counted from 0, where there are such.
+    pub fn place(&self) -> (Option<usize>, Option<usize>) {
+        match *self {
+            Self::UnknownPoint { pose, point, .. }
+            | Self::RepeatedPoint { pose, point }
+            | Self::Pixel { pose, point } => (Some(pose), Some(point)),
+            Self::PlateCoordinates { point } => (None, Some(point)),
+            Self::KnownPose { pose }
+            | Self::Mirrored { pose }
+            | Self::TooFewPoints { pose, .. }
+            | Self::NotLinked { pose, .. } => (Some(pose), None),
+            _ => (None, None),
+        }
+    }
+}

@@ -151,8 +151,10 @@ impl Problem<'_> {
                     *xy = None;
                 }
             }
-            self.minimise(&mut without, &others, false)?;
-            all.extend(self.predict_pose(&without, active, pose)?);
+            // the others may not determine everything: that is no fault of the calibration
+            if self.minimise(&mut without, &others, false).is_ok() {
+                all.extend(self.predict_pose(&without, active, pose)?);
+            }
         }
         Ok(all)
     }

@@ -279,8 +279,8 @@ impl<T: Real> Beta<T> {
         ]
     }
 
-    /// (x, y, h) and the gap |y₊ − y₋ − v₀| on the specimen.
-    fn decode(&self, c: [T; 4]) -> Result<([T; 3], f64), TraceError> {
+    /// (x, y, h) and the gap y₊ − y₋ − v₀ on the specimen.
+    fn decode(&self, c: [T; 4]) -> Result<([T; 3], T), TraceError> {
         finite(&c)?;
         let one = T::constant(1.0);
         let [x, y, delta] = self.measured(c);
@@ -292,7 +292,7 @@ impl<T: Real> Beta<T> {
         for s in scale {
             in_front(s / self.b2)?;
         }
-        let gap = ((c[3] - c[1] - self.disparity[1]) * scale[1]).value().abs();
+        let gap = (c[3] - c[1] - self.disparity[1]) * scale[1];
         Ok(([scale[0] * x, scale[1] * y, h], gap))
     }
 
@@ -331,10 +331,11 @@ impl<T: Real> Beta<T> {
 impl PairModel for Microscope {
     fn decode_pair(&self, pair: PixelPair) -> Result<Decoded, TraceError> {
         let c = pair.coordinates();
-        let (p, gap_mm) = self.beta::<Dual<4>>().decode(std::array::from_fn(|i| Dual::variable(c[i], i)))?;
+        let (p, gap) = self.beta::<Dual<4>>().decode(std::array::from_fn(|i| Dual::variable(c[i], i)))?;
         Ok(Decoded {
             point_mm: p.map(|p| p.value).into(),
-            gap_mm,
+            gap_mm: gap.value,
+            gap_jacobian: gap.gradient.into(),
             jacobian: Matrix3x4::from_fn(|i, j| p[i].gradient[j]),
         })
     }

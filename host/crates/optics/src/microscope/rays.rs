@@ -39,7 +39,7 @@ use crate::decode::{Decoded, PixelPair};
 use crate::grating::{Axes, Grating, SubstrateSide};
 use crate::model::TraceError;
 use crate::pair_model::PairModel;
-use crate::real::{Dual, Real, along, dot, solve2, sub};
+use crate::real::{Dual, Real, along, cross, dot, solve2, sub};
 use crate::setup::View;
 
 /// Objectives 1 and 2: from the specimen to the intermediate image.
@@ -204,16 +204,8 @@ impl RayMicroscope {
         let to_plane = -dot(at, axes.normal) / cosines.before[2];
         let mut origin = along(at, direction, to_plane);
         if g.substrate.thickness_mm > 0.0 {
-            // as in the macro set-up: one sideways shift serves both sides
-            let c = match g.substrate.side {
-                SubstrateSide::Camera => cosines.before,
-                SubstrateSide::Object => cosines.after,
-            };
-            let n = k(g.substrate.index);
-            let inside = (n * n - c[0] * c[0] - c[1] * c[1]).sqrt();
-            let t = k(g.substrate.thickness_mm) * (k(1.0) / inside - k(1.0) / c[2]);
-            origin = along(origin, axes.across, c[0] * t);
-            origin = along(origin, axes.along, c[1] * t);
+            let glass = &g.substrate;
+            origin = axes.past_plate(origin, &cosines, glass.side, k(glass.thickness_mm), k(glass.index));
         }
         Ok(Line { origin, direction: axes.to_world(cosines.after) })
     }
@@ -376,12 +368,14 @@ impl PairModel for RayMicroscope {
             }
         }
         let p = self.to_specimen(middle)?;
-        // the gap on the scale of the specimen
-        let gap = sub(on_a, on_b).map(Dual::value);
-        let gap_mm = dot(gap, gap).sqrt() / self.geometry.relay.magnification.abs();
+        // on the scale of the specimen, along its y
+        let normal = cross(a.direction, b.direction);
+        let magnification = Dual::constant(self.geometry.relay.magnification);
+        let gap = dot(w, normal) / (dot(normal, normal).sqrt() * magnification);
         Ok(Decoded {
             point_mm: p.map(|p| p.value).into(),
-            gap_mm,
+            gap_mm: gap.value,
+            gap_jacobian: gap.gradient.into(),
             jacobian: Matrix3x4::from_fn(|i, j| p[i].gradient[j]),
         })
     }

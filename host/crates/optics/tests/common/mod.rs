@@ -179,6 +179,11 @@ pub struct Normal(ChaCha8Rng);
 impl Normal {
     pub fn new(seed: u64) -> Self {
         println!("seed {seed}");
+        Self::quiet(seed)
+    }
+
+    /// The same where seeds are counted through.
+    pub fn quiet(seed: u64) -> Self {
         Self(ChaCha8Rng::seed_from_u64(seed))
     }
 

@@ -1,7 +1,9 @@
 //! Rules between values: each finding names field, value and allowed range.
 
 use super::problem::Finding;
-use super::{Axis, Experiment, FrameStep, Grating, Optics, OpticsFile, Processing, Rig, Step, Strobe};
+use super::{
+    Axis, Experiment, FrameStep, Grating, Microscope, Optics, OpticsFile, Processing, Rig, Step, Strobe,
+};
 use crate::units::{Length, Time};
 use daic_protocol::{channels, limits::MAX_LOOP_DEPTH};
 use std::fmt::Display;
@@ -42,7 +44,14 @@ impl Findings {
 pub(super) fn experiment(e: &Experiment) -> Vec<Finding> {
     let mut f = Findings::default();
     rig(&e.rig, &mut f);
-    optics(&e.optics, &mut f);
+    match (&e.optics, &e.microscope) {
+        (Some(o), None) => optics(o, &mut f),
+        (None, Some(m)) => microscope(m, &mut f),
+        (Some(_), Some(_)) => {
+            f.require(false, "microscope", "given besides [optics]", "one of [optics] and [microscope]");
+        }
+        (None, None) => f.require(false, "optics", "left out", "one of [optics] and [microscope]"),
+    }
     processing(&e.processing, &mut f);
     sequence(e, &mut f);
     f.0
@@ -82,6 +91,19 @@ pub(super) fn optics_file(file: &OpticsFile) -> Vec<Finding> {
             }
         }
     }
+    let maps = file.maps.clone().unwrap_or_default();
+    for (name, map) in [("sensor", maps.sensor), ("minus", maps.minus), ("plus", maps.plus)] {
+        let Some(map) = map else { continue };
+        f.require(!map.file.trim().is_empty(), format!("maps.{name}.file"), "empty", "the path of a map");
+        let hex = map.crc64.len() == 16 && map.crc64.bytes().all(|b| b.is_ascii_hexdigit());
+        f.require(hex, format!("maps.{name}.crc64"), format!("{:?}", map.crc64), "16 hexadecimal digits");
+    }
+    if let Some(v) = &file.volume {
+        for (name, [from, to]) in [("x", v.x), ("y", v.y), ("h", v.h)] {
+            let text = format!("{from} to {to}");
+            f.require(from.mm() < to.mm(), format!("volume.{name}"), text, "from the smaller to the larger");
+        }
+    }
     f.0
 }
 
@@ -106,7 +128,10 @@ fn rig(rig: &Rig, f: &mut Findings) {
     f.time("rig.camera.exposure_delay", camera.exposure_delay, false);
     f.time("rig.camera.exposure", camera.exposure, true);
     f.time("rig.camera.readout", camera.readout, false);
-    let busy = camera.exposure_delay.ns() + camera.exposure.ns() + camera.readout.ns();
+    f.time("rig.camera.row_time", camera.row_time, false);
+    f.time("rig.camera.row_time, times the rows", camera.rolling(), false);
+    let busy =
+        camera.exposure_delay.ns() + camera.exposure.ns() + camera.rolling().ns() + camera.readout.ns();
     f.require(
         camera.trigger_width.ns() < busy,
         "rig.camera.trigger_width",
@@ -154,7 +179,7 @@ fn axis(field: &str, axis: &Axis, f: &mut Findings) {
     }
 }
 
-/// The strobe must lie inside the exposure.
+/// The strobe must lie where all rows are exposed.
 fn strobe(rig: &Rig, strobe: &Strobe, field: &str, f: &mut Findings) {
     f.require(
         strobe.led < channels::LEDS,
@@ -168,9 +193,15 @@ fn strobe(rig: &Rig, strobe: &Strobe, field: &str, f: &mut Findings) {
     if let Some(level) = strobe.level {
         f.require((0.0..=1.0).contains(&level), format!("{field}.level"), level, "0 to 1");
     }
-    let begin = rig.camera.exposure_delay.ns();
-    let end = begin + rig.camera.exposure.ns();
-    let inside = format!("inside the exposure, {begin} ns to {end} ns after the trigger");
+    let first = rig.camera.exposure_delay.ns();
+    let end = first + rig.camera.exposure.ns();
+    let rolling = rig.camera.rolling().ns();
+    let begin = first + rolling;
+    let inside = if rolling > 0.0 {
+        format!("where all rows are exposed, {begin} ns to {end} ns after the trigger (rolling shutter)")
+    } else {
+        format!("inside the exposure, {begin} ns to {end} ns after the trigger")
+    };
     f.require(strobe.delay.ns() >= begin, format!("{field}.delay"), strobe.delay, inside.clone());
     f.require(
         strobe.delay.ns() + strobe.width.ns() <= end,
@@ -178,6 +209,12 @@ fn strobe(rig: &Rig, strobe: &Strobe, field: &str, f: &mut Findings) {
         format!("{} (LED off {} ns after the trigger)", strobe.width, strobe.delay.ns() + strobe.width.ns()),
         inside,
     );
+}
+
+fn microscope(m: &Microscope, f: &mut Findings) {
+    f.positive("microscope.pixel", m.pixel);
+    let search = m.search.px();
+    f.require((1.0..=10_000.0).contains(&search), "microscope.search", m.search, "1 px to 10000 px");
 }
 
 fn optics(o: &Optics, f: &mut Findings) {

@@ -6,16 +6,20 @@
 //! for editors.
 
 mod check;
+mod microscope;
 mod optics;
 mod problem;
 mod processing;
 mod rig;
 mod sequence;
 
-pub use optics::{Brown, Covariance, Grating, Optics, OpticsFile, Reference, Side, Substrate};
+pub use microscope::{Microscope, MicroscopeForm};
+pub use optics::{
+    Brown, Covariance, Grating, MapFile, Maps, Optics, OpticsFile, Reference, Side, Substrate, Volume,
+};
 pub use problem::{ConfigError, Problem, ProblemKind};
 pub use processing::{Criterion, Decoder, Interpolation, Processing, Shape, Solver};
-pub use rig::{Axes, Axis, CameraSection, CameraSource, Rig, Strobe};
+pub use rig::{Axes, Axis, Bayer, BayerChannel, BayerPattern, CameraSection, CameraSource, Rig, Strobe};
 pub use sequence::{FrameStep, LevelStep, MoveStep, RepeatStep, Role, Step};
 
 use schemars::JsonSchema;
@@ -32,8 +36,12 @@ pub struct Experiment {
     pub seed: u64,
     /// Trigger box, stage, camera, LEDs.
     pub rig: Rig,
-    /// What the light passes through.
-    pub optics: Optics,
+    /// What the light passes through; this or `microscope`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub optics: Option<Optics>,
+    /// The microscope that the light passes through.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub microscope: Option<Microscope>,
     /// How frames become results.
     #[serde(default)]
     pub processing: Processing,
@@ -44,6 +52,11 @@ pub struct Experiment {
 /// The commented template that `daic init` writes; it is a valid experiment.
 pub fn template() -> &'static str {
     include_str!("template.toml")
+}
+
+/// A commented experiment under the microscope, valid as it stands.
+pub fn microscope_template() -> &'static str {
+    include_str!("microscope.toml")
 }
 
 impl Experiment {
@@ -82,12 +95,17 @@ impl OpticsFile {
     pub fn parse(text: &str, path: &Path) -> Result<Self, ConfigError> {
         if problem::has_key(text, "rig") {
             let experiment = Experiment::parse(text, path)?;
+            let Some(optics) = experiment.optics else {
+                return Err(ConfigError::NoOptics { path: path.to_owned() });
+            };
             return Ok(Self {
                 format: None,
                 provenance: None,
                 date: None,
-                optics: experiment.optics,
+                optics,
                 covariance: None,
+                maps: None,
+                volume: None,
             });
         }
         let file: Self = problem::from_toml(text, path)?;

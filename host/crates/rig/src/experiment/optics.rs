@@ -164,6 +164,49 @@ pub struct OpticsFile {
     /// How sure its values are, in common for all points.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub covariance: Option<Covariance>,
+    /// Dense distortion maps on top of `optics.brown`; left out, none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub maps: Option<Maps>,
+    /// Where it was calibrated; left out, points are taken wherever they lie.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub volume: Option<Volume>,
+}
+
+/// Files of distortion maps. What is given adds up.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Maps {
+    /// For every pixel, whichever view it belongs to.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensor: Option<MapFile>,
+    /// For pixels of the −1 view, taken through the grating.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub minus: Option<MapFile>,
+    /// For pixels of the +1 view, taken through the grating.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub plus: Option<MapFile>,
+}
+
+/// A file beside this one.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct MapFile {
+    /// Its path, from the folder of this file on.
+    pub file: String,
+    /// CRC-64/XZ of its bytes, 16 hexadecimal digits: another map than the one meant is refused.
+    pub crc64: String,
+}
+
+/// A box of object coordinates, each from the smallest to the largest.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Volume {
+    /// To the right.
+    pub x: [Length; 2],
+    /// Down.
+    pub y: [Length; 2],
+    /// Towards the camera.
+    pub h: [Length; 2],
 }
 
 impl OpticsFile {

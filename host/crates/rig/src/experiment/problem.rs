@@ -52,6 +52,12 @@ pub enum ConfigError {
         /// Why.
         source: std::io::Error,
     },
+    /// An experiment under the microscope, where optics are wanted.
+    #[error("{} describes a microscope, which has no [optics]", path.display())]
+    NoOptics {
+        /// The file.
+        path: PathBuf,
+    },
     /// It was read, and something in it is wrong.
     #[error("{}", Listing(.path, .problems))]
     Invalid {
@@ -68,7 +74,7 @@ impl ConfigError {
     /// The problems found (none if the file could not be read).
     pub fn problems(&self) -> &[Problem] {
         match self {
-            Self::Read { .. } => &[],
+            Self::Read { .. } | Self::NoOptics { .. } => &[],
             Self::Invalid { problems, .. } => problems,
         }
     }

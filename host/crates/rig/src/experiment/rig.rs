@@ -58,6 +58,106 @@ pub struct CameraSection {
     /// From the end of the exposure until the camera takes the next trigger.
     #[serde(default = "readout")]
     pub readout: Time,
+    /// How much later than the row above it a row is exposed (rolling shutter); left out, all rows at once.
+    #[serde(default = "zero", skip_serializing_if = "is_zero")]
+    pub row_time: Time,
+    /// Colour mosaic of the sensor, of which one channel is used; left out, none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bayer: Option<Bayer>,
+}
+
+impl CameraSection {
+    /// How much later the last row is exposed than the first.
+    pub fn rolling(&self) -> Time {
+        Time::new(self.row_time.ns() * f64::from(self.height.saturating_sub(1)))
+    }
+}
+
+/// A Bayer mosaic and the channel that is used. Nothing is interpolated: the pixels of the channel are an image of
+/// half the columns and rows, whose positions are known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Bayer {
+    /// Colours of the pixels (0, 0), (1, 0), (0, 1), (1, 1).
+    pub pattern: BayerPattern,
+    /// Channel that is used.
+    pub channel: BayerChannel,
+}
+
+/// Colours of a Bayer cell, row by row from the top left.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum BayerPattern {
+    /// Red, green / green, blue.
+    Rggb,
+    /// Green, red / blue, green.
+    Grbg,
+    /// Green, blue / red, green.
+    Gbrg,
+    /// Blue, green / green, red.
+    Bggr,
+}
+
+/// A square lattice of pixels of one colour.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum BayerChannel {
+    /// Red.
+    R,
+    /// Green in the rows with red.
+    Gr,
+    /// Green in the rows with blue.
+    Gb,
+    /// Blue.
+    B,
+}
+
+impl Bayer {
+    /// Column and row, 0 or 1, of the channel's first pixel.
+    pub fn origin(self) -> [u32; 2] {
+        let red = match self.pattern {
+            BayerPattern::Rggb => [0, 0],
+            BayerPattern::Grbg => [1, 0],
+            BayerPattern::Gbrg => [0, 1],
+            BayerPattern::Bggr => [1, 1],
+        };
+        let [x, y] = red;
+        match self.channel {
+            BayerChannel::R => [x, y],
+            BayerChannel::Gr => [1 - x, y],
+            BayerChannel::Gb => [x, 1 - y],
+            BayerChannel::B => [1 - x, 1 - y],
+        }
+    }
+}
+
+/// `rggb:r`: pattern and channel.
+impl std::str::FromStr for Bayer {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let wrong = || {
+            format!(
+                "found `{text}`, wanted a pattern (rggb, grbg, gbrg, bggr) and a channel (r, gr, gb, b): rggb:r"
+            )
+        };
+        let (pattern, channel) = text.split_once(':').ok_or_else(wrong)?;
+        let pattern = match pattern {
+            "rggb" => BayerPattern::Rggb,
+            "grbg" => BayerPattern::Grbg,
+            "gbrg" => BayerPattern::Gbrg,
+            "bggr" => BayerPattern::Bggr,
+            _ => return Err(wrong()),
+        };
+        let channel = match channel {
+            "r" => BayerChannel::R,
+            "gr" => BayerChannel::Gr,
+            "gb" => BayerChannel::Gb,
+            "b" => BayerChannel::B,
+            _ => return Err(wrong()),
+        };
+        Ok(Self { pattern, channel })
+    }
 }
 
 /// Where frames come from.
@@ -148,6 +248,9 @@ fn trigger_width() -> Time {
 }
 fn zero() -> Time {
     Time::new(0.0)
+}
+fn is_zero(time: &Time) -> bool {
+    time.ns() == 0.0
 }
 fn readout() -> Time {
     Time::new(20e6)

@@ -3,11 +3,20 @@
 //! Every step answers with measured numbers, what to turn or move and by how much. Its result can be
 //! added to a record (TOML, a table for each step); the last step writes an optics file.
 
+mod guide;
+mod record;
+mod watch;
+
+pub use guide::{GuideStep, State, guide};
+use record::read_record;
+pub use record::{record, write_optics};
+pub use watch::{Sight, Until, Watched, watch};
+
 use crate::calibrate_camera::{board_points, find, grey};
 use crate::camera_file::{self, CameraFile};
 use crate::error::Error;
 use crate::images;
-use daic_dataset::{GreyImage, atomic};
+use daic_dataset::GreyImage;
 use daic_optics::GreyView;
 use daic_optics::align::axis::{Axis, Offset, axis, grating_tilt, offset};
 use daic_optics::align::distance::{pinhole_to_grating, pinhole_to_line};
@@ -16,10 +25,8 @@ use daic_optics::align::spots::{Spot, find_disc, find_spots};
 use daic_optics::align::{AlignError, Measured};
 use daic_optics::intrinsics::{CameraParameter, pose_of_board};
 use daic_optics::target::{Pattern, TargetSettings};
-use daic_rig::experiment::{self, OpticsFile};
-use daic_rig::units::{Length, Pixels};
 use serde::Serialize;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// What a step found.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -228,6 +235,37 @@ pub struct Orders {
     pub relative_rad: Option<Measured>,
 }
 
+/// By how much the grooves stand otherwise than in the record's step `orders`, in a sentence, if it stands out.
+fn changed(record: &toml::Table, now: &OrderLine) -> Option<String> {
+    let before = record.get("orders")?.get("found")?.get("first")?.get("angle_rad")?;
+    let of = |name: &str| before.get(name).and_then(toml::Value::as_float);
+    let before = Measured::new(of("value")?, of("sigma")?);
+    let change = Measured::new(now.angle_rad.value - before.value, now.angle_rad.sigma.hypot(before.sigma));
+    change.stands_out(NOTHING).then(|| {
+        let sign = if change.value > 0.0 { '+' } else { '−' };
+        format!("since step orders the gratings have turned about z by {sign}{}", say(change, 1e3, "mrad"))
+    })
+}
+
+/// [`orders`] after the gratings came back onto the rail: also what has changed since that step of `record`.
+///
+/// # Errors
+/// As [`orders`]; a record that cannot be read.
+pub fn orders_again(
+    camera: &CameraFile,
+    image: &Path,
+    other: Option<&Path>,
+    shift: Option<f64>,
+    record: &Path,
+) -> Result<Step<Orders>, Error> {
+    let record = read_record(record)?;
+    let step = orders(camera, image, other, shift)?;
+    let mut advice = step.advice;
+    advice.extend(changed(&record, &step.found.first));
+    let images: Vec<&Path> = [Some(image), other].into_iter().flatten().collect();
+    Ok(Step::new("orders_again", &images, advice, step.found))
+}
+
 /// Grooves along y: the orders −1, 0, +1 of the beam through a grating, and through the other one.
 ///
 /// # Errors
@@ -301,7 +339,14 @@ pub fn distance(camera: &CameraFile, image: &Path, options: &BoardOptions) -> Re
     // The longest row, from its first to its last point.
     let row = |p: &daic_optics::target::TargetPoint| p.index[1];
     let ends = target.points.chunk_by(|a, b| row(a) == row(b)).map(|r| (r[0], r[r.len() - 1]));
-    let Some((a, b)) = ends.max_by_key(|(a, b)| b.index[0] - a.index[0]) else {
+    // of the longest rows the one nearest the axis: D is counted along it
+    let axis = camera.camera.principal_point_px[1];
+    let off = |(a, b): &(daic_optics::target::TargetPoint, daic_optics::target::TargetPoint)| {
+        (0.5 * (a.at_px[1] + b.at_px[1]) - axis).abs()
+    };
+    let longest = ends.clone().map(|(a, b)| b.index[0] - a.index[0]).max();
+    let rows = ends.filter(|(a, b)| Some(b.index[0] - a.index[0]) == longest);
+    let Some((a, b)) = rows.min_by(|p, q| off(p).total_cmp(&off(q))) else {
         return Err(at(image)(AlignError::Spots { found: 0, needed: 2 }));
     };
     let ideal = |p: [f64; 2]| camera.camera.undistort_px(p).map_err(|e| at(image)(e.into()));
@@ -329,58 +374,4 @@ pub fn distance(camera: &CameraFile, image: &Path, options: &BoardOptions) -> Re
         grating_to_board_mm: options.grating_to_board_mm,
     };
     Ok(Step::new("distance", &[image], advice, found))
-}
-
-/// Adds a step to a record, in place of one of the same name.
-///
-/// # Errors
-/// A record that cannot be read or written.
-pub fn record<T: Serialize>(path: &Path, step: &Step<T>) -> Result<(), Error> {
-    let unwritable = |reason: String| Error::Unwritable { path: path.to_owned(), reason };
-    let mut table = match std::fs::read_to_string(path) {
-        Ok(text) => text
-            .parse::<toml::Table>()
-            .map_err(|e| Error::AlignRecord { path: path.to_owned(), reason: e.to_string() })?,
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => toml::Table::new(),
-        Err(source) => return Err(Error::Read { path: path.to_owned(), source }),
-    };
-    table.insert("format".into(), "daic-alignment/1".into());
-    table.insert("units".into(), "lengths mm, images px, angles rad unless the name says deg".into());
-    let value = toml::Value::try_from(step).map_err(|e| unwritable(e.to_string()))?;
-    table.insert(step.step.to_owned(), value);
-    let text = toml::to_string(&table).map_err(|e| unwritable(e.to_string()))?;
-    Ok(atomic::write_bytes(path, text.as_bytes())?)
-}
-
-/// Writes the optics file `from` with camera and distances as found to `to`; d counts from the
-/// board, which is the reference plane.
-///
-/// # Errors
-/// A file that cannot be read or written.
-pub fn write_optics(
-    from: &Path,
-    to: &Path,
-    camera: &CameraFile,
-    found: &Step<Distance>,
-) -> Result<PathBuf, Error> {
-    let mut file = OpticsFile::load(from)?;
-    let b = camera.camera.brown;
-    let brown = experiment::Brown { k1: b.k1, k2: b.k2, k3: b.k3, p1: b.p1, p2: b.p2 };
-    file.optics.focal = Pixels::new(camera.camera.focal_px);
-    file.optics.principal_point = camera.camera.principal_point_px.map(Pixels::new);
-    file.optics.brown = (brown != experiment::Brown::default()).then_some(brown);
-    file.optics.pinhole_to_grating = Length::new(found.found.pinhole_to_grating_mm.value);
-    file.optics.grating_to_reference = Length::new(found.found.grating_to_board_mm.value);
-    file.provenance = Some(format!(
-        "camera of {} ({}), distances of {} ({}, {})",
-        camera.date,
-        camera.program,
-        found.images.join(", "),
-        found.date,
-        found.program
-    ));
-    let text = toml::to_string(&file)
-        .map_err(|e| Error::Unwritable { path: to.to_owned(), reason: e.to_string() })?;
-    atomic::write_bytes(to, text.as_bytes())?;
-    Ok(to.to_owned())
 }

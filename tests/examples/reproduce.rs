@@ -1,0 +1,41 @@
+//! Reproduces a chapter of the thesis and writes its part of `docs/reproduction.md`:
+//! `reproduce macro|micro [--quick] [DOCS]`.
+
+use daic_tests::reproduce::{Extent, ReproduceError, document, macroscopic, microscopic};
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+fn run(chapter: &str, extent: Extent, docs: &std::path::Path) -> Result<(), ReproduceError> {
+    let part = match chapter {
+        "macro" => macroscopic::part(&macroscopic::run(extent, &|what| println!("{what}"))?)?,
+        _ => microscopic::part(&microscopic::run(extent)?)?,
+    };
+    println!("{}", part.text);
+    document::write(docs, &part)
+}
+
+fn main() -> ExitCode {
+    let mut arguments: Vec<String> = std::env::args().skip(1).collect();
+    let before = arguments.len();
+    arguments.retain(|a| a != "--quick");
+    let extent = if arguments.len() < before { Extent::Quick } else { Extent::Full };
+    let (chapter, docs) = match arguments.as_slice() {
+        [chapter] => (chapter, daic_tests::shared::root().join("docs")),
+        [chapter, docs] => (chapter, PathBuf::from(docs)),
+        _ => {
+            eprintln!("reproduce macro|micro [--quick] [DOCS]");
+            return ExitCode::from(2);
+        }
+    };
+    if !["macro", "micro"].contains(&chapter.as_str()) {
+        eprintln!("reproduce: no chapter `{chapter}`: macro or micro");
+        return ExitCode::from(2);
+    }
+    match run(chapter, extent, &docs) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("reproduce: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
