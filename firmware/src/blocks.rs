@@ -79,6 +79,23 @@ impl Packer {
         self.hold(until.saturating_sub(MIN), out);
     }
 
+    /// Nothing happens before `until`, and what comes then is not known yet: what there is goes out now, as a
+    /// full block that reaches there. False: there is no time for as many records.
+    pub fn flush(&mut self, until: u64, out: &mut dyn FnMut(&Block)) -> bool {
+        let until = until.saturating_sub(MIN);
+        let time = until.saturating_sub(self.upto);
+        let left = (BLOCK as u64).saturating_sub(self.records.len() as u64).max(1);
+        let most = u64::from(MAX_HOLD);
+        let each = time.checked_div(left).unwrap_or(0).min(most);
+        if each < MIN {
+            return false;
+        }
+        for _ in 0..left {
+            self.push(u32::try_from(each).unwrap_or(MAX_HOLD), out);
+        }
+        true
+    }
+
     /// The run is over at `tick` and the safe word stands: fills the block, and one more, so that
     /// whatever looks ahead in the player finds the safe word.
     pub fn finish(&mut self, tick: u64, out: &mut dyn FnMut(&Block)) {

@@ -1,27 +1,36 @@
 //! Staged loading: a program is complete and valid before it replaces the old one.
 
 use crate::board::Board;
-use crate::verifier;
-use daic_protocol::limits::{CHUNK_LEN, MAX_PROGRAM_BYTES};
-use daic_protocol::message::Refusal;
+use crate::stream::{Source, Stream};
+use crate::verifier::{self, Checker};
+use daic_protocol::limits::{CHUNK_LEN, MAX_PROGRAM_BYTES, STREAM_BYTES};
+use daic_protocol::message::{Refusal, StreamState};
 use daic_protocol::program::{self, ProgramBytes};
 
 /// One bit per chunk received.
 type ChunkSet = u128;
 const _: () = assert!(MAX_PROGRAM_BYTES.div_ceil(CHUNK_LEN) <= ChunkSet::BITS as usize);
 
-/// The committed program and the one being received.
+/// The committed program and the one being received: staged whole, or streamed.
 #[derive(Debug)]
 pub(crate) struct Loader {
     live: ProgramBytes,
     hash: Option<u32>,
     staged: ProgramBytes,
     staging: Option<ChunkSet>,
+    /// The stream whose ring is `staged`.
+    stream: Option<Stream>,
 }
 
 impl Loader {
     pub(crate) const fn new() -> Self {
-        Self { live: ProgramBytes::new(), hash: None, staged: ProgramBytes::new(), staging: None }
+        Self {
+            live: ProgramBytes::new(),
+            hash: None,
+            staged: ProgramBytes::new(),
+            staging: None,
+            stream: None,
+        }
     }
 
     /// Hash of the committed program.
@@ -34,12 +43,92 @@ impl Loader {
         &self.live
     }
 
+    /// What is played: the stream if there is one, else the committed program.
+    pub(crate) fn source(&mut self) -> Source<'_> {
+        match &mut self.stream {
+            Some(stream) => Source::Stream(stream, &self.staged),
+            None => Source::Stored(&self.live),
+        }
+    }
+
+    /// What is played, for one who reads ahead.
+    pub(crate) fn source_ahead(&self) -> Source<'_> {
+        match &self.stream {
+            Some(stream) => Source::Ahead(stream, &self.staged),
+            None => Source::Stored(&self.live),
+        }
+    }
+
+    /// The stream takes nothing any more.
+    pub(crate) fn seal_stream(&mut self) {
+        if let Some(stream) = &mut self.stream {
+            stream.seal();
+        }
+    }
+
+    /// The stream, if there is one.
+    pub(crate) fn stream(&self) -> Option<&Stream> {
+        self.stream.as_ref()
+    }
+
+    /// Begins a stream; drops what was staged.
+    pub(crate) fn begin_stream(&mut self, checker: Checker) {
+        self.staging = None;
+        self.staged.clear();
+        // It is as long as its capacity.
+        let _ = self.staged.resize(STREAM_BYTES, 0);
+        self.stream = Some(Stream::new(checker));
+    }
+
+    /// Forgets the stream.
+    pub(crate) fn end_stream(&mut self) {
+        if self.stream.take().is_some() {
+            self.staged.clear();
+        }
+    }
+
+    pub(crate) fn write_stream(
+        &mut self,
+        offset: u32,
+        data: &[u8],
+        board: &Board,
+        played: Option<u64>,
+    ) -> Result<(), Refusal> {
+        let stream = self.stream.as_mut().ok_or(Refusal::NotStreaming)?;
+        stream.write(offset, data, &mut self.staged, board, played)
+    }
+
+    pub(crate) fn close_stream(&mut self, length: u32, hash: u32) -> Result<(), Refusal> {
+        self.stream.as_mut().ok_or(Refusal::NotStreaming)?.end(length, hash)
+    }
+
+    pub(crate) fn stream_state(&self, played: u64) -> Result<StreamState, Refusal> {
+        self.stream.as_ref().map(|s| s.state(played)).ok_or(Refusal::NotStreaming)
+    }
+
+    /// Takes a program from elsewhere, verified as at commit; what was staged is dropped.
+    pub(crate) fn take(
+        &mut self,
+        board: &Board,
+        fetch: impl FnOnce(&mut ProgramBytes) -> Result<(), Refusal>,
+    ) -> Result<(), Refusal> {
+        (self.staging, self.stream) = (None, None);
+        self.staged.clear();
+        fetch(&mut self.staged)?;
+        verifier::verify(&self.staged, board).map_err(Refusal::Invalid)?;
+        self.replace();
+        self.hash = Some(program::hash(&self.live));
+        self.staged.clear();
+        Ok(())
+    }
+
     pub(crate) fn begin(&mut self, length: u32) -> Result<(), Refusal> {
         let too_long = Refusal::ProgramTooLong { length, max: MAX_PROGRAM_BYTES as u32 };
         let bytes = usize::try_from(length).map_err(|_| too_long)?;
         if bytes > MAX_PROGRAM_BYTES {
             return Err(too_long);
         }
+        self.stream = None;
         self.staged.clear();
         self.staged.resize(bytes, 0).map_err(|_| too_long)?;
         self.staging = Some(0);
@@ -81,14 +170,22 @@ impl Loader {
             return Err(Refusal::HashDiffers { computed, given: hash });
         }
         verifier::verify(&self.staged, board).map_err(Refusal::Invalid)?;
-        core::mem::swap(&mut self.live, &mut self.staged);
+        self.replace();
         self.hash = Some(hash);
         self.abort();
         Ok(())
     }
 
+    /// What is staged becomes the program. Copied in place: swapped they would need room for both on the stack.
+    fn replace(&mut self) {
+        self.live.clear();
+        // Both have the same capacity.
+        let _ = self.live.extend_from_slice(&self.staged);
+    }
+
     pub(crate) fn abort(&mut self) {
-        self.staged.clear();
-        self.staging = None;
+        if self.staging.take().is_some() {
+            self.staged.clear();
+        }
     }
 }

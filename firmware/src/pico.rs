@@ -3,6 +3,7 @@
 use crate::board::{AxisLimits, Board, LedLimits};
 use daic_protocol::channels;
 use daic_protocol::limits::TICK_HZ;
+use daic_protocol::message::Capabilities;
 
 /// LEDs of the board.
 pub const LEDS: u8 = 4;
@@ -23,6 +24,14 @@ pub const ONBOARD: u8 = 25;
 pub const LEVEL: [u8; 4] = [16, 17, 18, 19];
 /// GPIO of the interlock: high permits, low (or an open wire) makes every output safe.
 pub const INTERLOCK: u8 = 20;
+
+/// GPIO of each input, as (bit of the input word, GPIO): trigger inputs 0 and 1, exposure-active line of
+/// camera 0, limit switches at the low end of axes 0 and 1, interlock.
+pub const INPUTS: [(u8, u8); 6] = [(0, 21), (1, 22), (8, 26), (12, 27), (14, 28), (24, INTERLOCK)];
+/// Slots for programs.
+pub const SLOTS: u8 = 4;
+/// [`Board::input_latency`] of the board: 1 ms, in which the player is fed a few times.
+pub const INPUT_LATENCY: u32 = TICK_HZ / 1000;
 
 /// Pins that the player drives, [`OUT_BASE`] first: the lines, nothing, the on-board LED.
 pub const OUT_PINS: u8 = ONBOARD - OUT_BASE + 1;
@@ -60,20 +69,41 @@ pub const fn pin_word(word: u32) -> u32 {
 
 impl Board {
     /// A Raspberry Pi Pico: 4 LEDs (10 ms at most, level settled after 2 ms), 2 cameras, 2 axes of
-    /// ±50 mm at 6400 steps per millimetre, 5 mm/s, 312.5 mm/s².
+    /// ±50 mm at 6400 steps per millimetre, 5 mm/s, 312.5 mm/s², 2 trigger inputs answered after 1 ms.
     pub fn pico() -> Self {
-        let axis = AxisLimits { min: -320_000, max: 320_000, max_rate: 32_000, max_acceleration: 2_000_000 };
-        let led = LedLimits { max_pulse: TICK_HZ / 100, settle: TICK_HZ / 500 };
+        let axis = AxisLimits {
+            min: -320_000,
+            max: 320_000,
+            max_rate: 32_000,
+            max_acceleration: 2_000_000,
+            max_jerk: 1_000_000_000,
+            home: None,
+        };
+        let led = LedLimits::new(TICK_HZ / 100, TICK_HZ / 500);
         Self {
             name: "pico",
-            capabilities: 0,
+            capabilities: Capabilities::TRIGGER_INPUTS
+                | Capabilities::JERK
+                | Capabilities::STREAMING
+                | Capabilities::FLASH
+                | Capabilities::INTERLOCK
+                | Capabilities::EXPOSURE_ACTIVE,
             axes: heapless::Vec::from_array([axis; AXES as usize]),
-            leds: heapless::Vec::from_array([led; LEDS as usize]),
+            leds: heapless::Vec::from_array([led.clone(), led.clone(), led.clone(), led]),
             cameras: CAMERAS,
+            inputs: 2,
+            // Three blocks of a wait.
+            input_latency: INPUT_LATENCY,
             // 10 ms: some 450 words, so that a burst at the beginning does not outrun the processor.
             start_lead: TICK_HZ as u64 / 100,
         }
     }
+}
+
+/// The input word for the levels of all GPIOs.
+pub fn input_word(levels: u32) -> u32 {
+    let high = |gpio: u8| levels.checked_shr(u32::from(gpio)).unwrap_or(0) & 1;
+    INPUTS.iter().fold(0, |word, &(bit, gpio)| word | high(gpio).checked_shl(u32::from(bit)).unwrap_or(0))
 }
 
 const _: () = assert!(AUXILIARY == (channels::EDGE_MASK >> 12).count_ones() as u8);

@@ -64,9 +64,14 @@ impl Replies {
     pub(crate) fn keep(&mut self, id: u32, crc: u32, request: &Request, frame: &[u8]) {
         match request {
             Request::Hello => {}
-            Request::Status | Request::Health | Request::ReadEvents { .. } | Request::Clock => {
-                self.reads.keep(id, crc, frame)
-            }
+            Request::Status
+            | Request::ReadEvents { .. }
+            | Request::Clock
+            | Request::StreamStatus
+            | Request::Inputs
+            | Request::Slots
+            | Request::SelfTest
+            | Request::Health => self.reads.keep(id, crc, frame),
             _ => self.effects.keep(id, crc, frame),
         }
     }

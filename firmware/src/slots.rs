@@ -3,10 +3,13 @@
 //! A slot has two areas. A program is written into the one that does not hold the newest, data
 //! first, header last: before the header is whole the area is not valid, and the other still is. A
 //! slot is emptied older area first, so that an older program never comes back.
+//!
+//! When a program starts by itself is kept in the tag of its slot ([`tag`], [`autostart`]).
 
 use daic_protocol::frame::crc32;
-use daic_protocol::limits::MAX_PROGRAM_BYTES;
-use daic_protocol::program::ProgramBytes;
+use daic_protocol::limits::{MAX_PROGRAM_BYTES, MAX_SLOTS};
+use daic_protocol::message::{Autostart, SlotError, SlotInfo};
+use daic_protocol::program::{Hasher, ProgramBytes};
 
 /// Bytes that are erased at once.
 pub const SECTOR: u32 = 4096;
@@ -41,29 +44,6 @@ pub struct Stored {
     sequence: u32,
     area: u32,
 }
-
-/// Why a slot could not be read or written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SlotError {
-    /// No such slot.
-    NoSuchSlot,
-    /// Nothing is stored there.
-    Empty,
-    /// What was written is not what is read.
-    WriteFailed,
-}
-
-impl core::fmt::Display for SlotError {
-    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        f.write_str(match self {
-            Self::NoSuchSlot => "there is no such slot",
-            Self::Empty => "the slot is empty",
-            Self::WriteFailed => "what was written to flash is not what is read from it",
-        })
-    }
-}
-
-impl core::error::Error for SlotError {}
 
 /// Bytes of flash that `slots` slots take.
 pub const fn size(slots: u8) -> u32 {
@@ -101,17 +81,27 @@ impl<F: Flash> Slots<F> {
         }
     }
 
-    /// The program of a slot.
+    /// Copies the program of a slot into `program`.
     ///
     /// # Errors
-    /// [`SlotError::NoSuchSlot`], [`SlotError::Empty`].
-    pub fn load(&self, slot: u8) -> Result<(Stored, ProgramBytes), SlotError> {
+    /// [`SlotError::NoSuchSlot`], [`SlotError::Empty`], [`SlotError::Damaged`].
+    pub fn load(&self, slot: u8, program: &mut ProgramBytes) -> Result<Stored, SlotError> {
         let stored = self.stored(slot)?;
-        let mut program = ProgramBytes::new();
-        let length = usize::try_from(stored.length).map_err(|_| SlotError::Empty)?;
-        program.resize(length, 0).map_err(|_| SlotError::Empty)?;
-        self.flash.read(stored.area.saturating_add(PAGE as u32), &mut program);
-        if crc32(&program) == stored.hash { Ok((stored, program)) } else { Err(SlotError::Empty) }
+        let length = usize::try_from(stored.length).map_err(|_| SlotError::Damaged)?;
+        program.clear();
+        program.resize(length, 0).map_err(|_| SlotError::Damaged)?;
+        self.flash.read(stored.area.saturating_add(PAGE as u32), program);
+        if crc32(program) == stored.hash { Ok(stored) } else { Err(SlotError::Damaged) }
+    }
+
+    /// What the slots hold, empty ones left out.
+    pub fn list(&self) -> heapless::Vec<SlotInfo, MAX_SLOTS> {
+        let used = (0..self.count).filter_map(|slot| {
+            let stored = self.stored(slot).ok()?;
+            let (length, hash) = (stored.length, stored.hash);
+            Some(SlotInfo { slot, length, hash, autostart: autostart(stored.tag) })
+        });
+        used.take(MAX_SLOTS).collect()
     }
 
     /// Replaces the program of a slot; until that is complete the old one stays.
@@ -190,7 +180,7 @@ impl<F: Flash> Slots<F> {
 
     /// CRC of the program of an area.
     fn sum(&self, stored: &Stored) -> Option<u32> {
-        let mut digest = daic_protocol::frame::Digest::new();
+        let mut digest = Hasher::new();
         let mut left = usize::try_from(stored.length).ok()?;
         let mut at = stored.area.checked_add(PAGE as u32)?;
         while left > 0 {
@@ -202,6 +192,24 @@ impl<F: Flash> Slots<F> {
             at = at.checked_add(PAGE as u32)?;
         }
         Some(digest.finish())
+    }
+}
+
+/// The tag of a program that starts so.
+pub const fn tag(autostart: Autostart) -> [u8; 4] {
+    match autostart {
+        Autostart::Off => [0; 4],
+        Autostart::PowerUp => [1, 0, 0, 0],
+        Autostart::Input { input } => [2, input, 0, 0],
+    }
+}
+
+/// How a program with this tag starts.
+pub const fn autostart(tag: [u8; 4]) -> Autostart {
+    match tag {
+        [1, 0, 0, 0] => Autostart::PowerUp,
+        [2, input, 0, 0] => Autostart::Input { input },
+        _ => Autostart::Off,
     }
 }
 

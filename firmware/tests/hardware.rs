@@ -10,7 +10,7 @@ use daic_firmware::{Board, Reached};
 use daic_protocol::frame::{MAX_FRAME, encode_request};
 use daic_protocol::limits::MIN_STEP_TICKS;
 use daic_protocol::message::*;
-use daic_protocol::program::{self, Instruction};
+use daic_protocol::program::{self, Condition, Instruction, Timeout};
 use proptest::prelude::*;
 
 /// Words of the run under way as the look-ahead finds them.
@@ -18,16 +18,44 @@ fn words_ahead(rig: &Rig) -> (Vec<(u64, u32)>, Reached) {
     let mut ahead = rig.controller.ahead().unwrap();
     let mut out = Recorder::default();
     loop {
-        let due = ahead.due();
-        match ahead.play(due, &rig.controller, &mut out) {
+        let due = ahead.due(&rig.controller);
+        match ahead.play(due, rig.now, &rig.controller, &mut out) {
             Reached::Waiting(tick) => assert!(tick > due),
             end => return (out.words, end),
         }
     }
 }
 
+/// A program that waits for inputs again and again.
+fn waiting() -> impl Strategy<Value = Vec<Instruction>> {
+    let conditions = [Condition::Rising, Condition::Falling, Condition::High, Condition::Low];
+    let kinds = [Timeout::Continue, Timeout::Continue, Timeout::Stop, Timeout::Fault];
+    let wait =
+        (0u8..2, 0usize..4, 0u32..2, 20u32..60, prop_oneof![2 => 100u32..900, 1 => Just(0)], 0usize..4)
+            .prop_map(move |(input, condition, skip, delay, timeout, kind)| Instruction::Wait {
+                input,
+                condition: conditions[condition],
+                skip: if condition < 2 { skip } else { 0 },
+                delay,
+                timeout,
+                on_timeout: kinds[kind],
+            })
+            .prop_map(|wait| vec![wait]);
+    let pulse = (0usize..3, 4u32..200, 4u32..40).prop_map(|(line, before, length)| {
+        let mask = [1, 0x100, 0x1000][line];
+        vec![edge(mask, mask, before), edge(mask, 0, length)]
+    });
+    let gate = prop_oneof![
+        Just(Instruction::NoGate),
+        any::<bool>().prop_map(|open_high| Instruction::Gate { input: 1, open_high })
+    ]
+    .prop_map(|gate| vec![gate]);
+    let part = prop_oneof![3 => wait, 1 => gate, 2 => random::program(true), 4 => pulse];
+    prop::collection::vec(part, 1..8).prop_map(|parts| parts.concat())
+}
+
 proptest! {
-    #![proptest_config(random::config(400))]
+    #![proptest_config(ProptestConfig { max_global_rejects: 20_000, ..random::config(400) })]
 
     /// The look-ahead finds what the controller then plays, at any time in the run.
     #[test]
@@ -61,20 +89,20 @@ proptest! {
         let mut ahead = rig.controller.ahead().unwrap();
         let mut out = Recorder::default();
         let mut ended = None;
-        while ended.is_none() && ahead.due() <= start + handed {
-            let due = ahead.due();
-            if let Reached::Ended(tick) = ahead.play(due, &rig.controller, &mut out) {
+        while ended.is_none() && ahead.due(&rig.controller) <= start + handed {
+            let due = ahead.due(&rig.controller);
+            if let Reached::Ended(tick) = ahead.play(due, rig.now, &rig.controller, &mut out) {
                 ended = Some(tick);
             }
         }
-        rig.controller.committed(ahead.due());
+        rig.controller.committed(ahead.due(&rig.controller));
         rig.play_to(start + at.min(handed));
         if rig.controller.state() == State::Running && ended.is_none() {
             rig.done(Request::Stop);
         }
         while ended.is_none() {
-            let due = ahead.due();
-            if let Reached::Ended(tick) = ahead.play(due, &rig.controller, &mut out) {
+            let due = ahead.due(&rig.controller);
+            if let Reached::Ended(tick) = ahead.play(due, rig.now, &rig.controller, &mut out) {
                 ended = Some(tick);
             }
         }
@@ -82,6 +110,72 @@ proptest! {
         prop_assert_eq!(&rig.out.words, &out.words);
         let done = rig.events().pop().unwrap();
         prop_assert_eq!(Some(done.tick), ended);
+    }
+
+    /// A player that is told of its inputs late and filled in advance puts out what the controller says,
+    /// and is never asked for a word whose time has come. So with a stop at any time.
+    #[test]
+    fn a_player_in_hardware_answers_inputs(
+        instructions in waiting(),
+        changes in prop::collection::vec((1u64..200, 0u32..4), 0..40),
+        turns in prop::collection::vec(1u64..18, 20),
+        stop in prop_oneof![Just(u64::MAX), 0u64..4000],
+    ) {
+        let mut rig = Rig::new(small_board());
+        let bytes = program::encode(&instructions).unwrap();
+        prop_assume!(matches!(rig.load_bytes(&bytes), Reply::Done { .. }));
+        let start = rig.start_again(&bytes);
+        let mut ahead = rig.controller.ahead().unwrap();
+        let mut out = Recorder::default();
+        let mut at = start;
+        let mut changes: Vec<_> = changes.iter().map(|&(gap, word)| { at += gap; (at, word) }).collect();
+        changes.reverse();
+        let mut over = false;
+        for turn in turns.iter().cycle().take(3000) {
+            let before = rig.now;
+            let now = before + turn + start.saturating_sub(before);
+            while let Some((tick, word)) = changes.pop_if(|change| change.0 <= now) {
+                rig.input(tick, word);
+                if rig.controller.state() == State::Running && !over {
+                    ahead.inputs(tick, word, &rig.controller, &mut out);
+                }
+            }
+            rig.play_to(now);
+            if rig.controller.state() != State::Running {
+                break;
+            }
+            let had = out.words.len();
+            let reach = now + 100;
+            if !over {
+                match ahead.play(reach, now, &rig.controller, &mut out) {
+                    Reached::Waiting(_) => {}
+                    Reached::Ended(_) => over = true,
+                    other => return Err(TestCaseError::fail(format!("{other:?}"))),
+                }
+            }
+            if before >= start {
+                prop_assert!(out.words[had..].iter().all(|w| w.0 > now), "too late: {:?} at {now}", &out.words[had..]);
+            }
+            rig.controller.committed(ahead.due(&rig.controller));
+            if now >= start + stop.min(1 << 40) && stop != u64::MAX && rig.controller.state() == State::Running {
+                let reply = rig.ask(Request::Stop);
+                prop_assert!(matches!(reply, Reply::Done { .. }), "{reply:?}");
+            }
+        }
+        match rig.controller.state() {
+            State::Running => {
+                // Waits for an input for ever: what came so far is the same.
+                let common = rig.out.words.len();
+                prop_assert_eq!(&rig.out.words[..], &out.words[..common]);
+            }
+            // A fault by an input ends at once, whatever has been handed over.
+            State::Faulted => {
+                let common = rig.out.words.len().saturating_sub(1);
+                prop_assert!(out.words.len() >= common);
+                prop_assert_eq!(&rig.out.words[..common], &out.words[..common]);
+            }
+            _ => prop_assert_eq!(&rig.out.words, &out.words),
+        }
     }
 
     /// Blocks hold the timeline, without gaps, whatever it is and however often time is filled.
@@ -216,6 +310,7 @@ fn lines_and_pins() {
 #[test]
 fn a_trip_ends_the_run() {
     let mut rig = Rig::new(Board::pico());
+    rig.input(1, daic_protocol::channels::INTERLOCK);
     let edge = |value, after| Instruction::Edge { mask: 0x100, value, after };
     let start = rig.start(&[edge(0x100, 1000), edge(0, 1000), edge(0x100, 1000), edge(0, 1000)]);
     rig.play_to(start + 10);

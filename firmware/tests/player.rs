@@ -57,6 +57,42 @@ fn strobed_frames_with_a_move_between() {
     assert_eq!(run.broken, Default::default());
 }
 
+/// The end of a move beside the program makes way for the word that follows at once.
+#[test]
+fn a_word_right_after_a_move_beside_it() {
+    let aside = Instruction::Go { axis: 0, target: 3, max_rate: 50_000, acceleration: 1_000_000, jerk: 0 };
+    for after in 0..6 {
+        let program = [aside, Instruction::Reach, edge(0x100, 0x100, after), edge(0x100, 0, 9)];
+        let run = compare(&mut Rig::new(small_board()), &program, None);
+        assert_eq!(run.broken, Default::default());
+        for pair in run.words.windows(2) {
+            assert!(pair[1].0 - pair[0].0 >= 4, "{after}: {pair:?}");
+        }
+    }
+}
+
+/// Played from one thing due to the next: each look makes progress, also where a step waits for a word.
+#[test]
+fn what_is_due_is_done() {
+    let aside = Instruction::Go { axis: 0, target: 3, max_rate: 50_000, acceleration: 1_000_000, jerk: 0 };
+    // The first step of this move is planned 4 + 625 ticks and 176 776 after its begin.
+    for shift in 0..8 {
+        let at = 4 + 625 + 176_776 - 4 + shift;
+        let program = [aside, edge(0x100, 0x100, at), edge(0x100, 0, 9), Instruction::Reach];
+        let mut rig = Rig::new(small_board());
+        let expected = compare(&mut rig, &program, None);
+        let mut rig = Rig::new(small_board());
+        rig.start(&program);
+        let mut looks = 0;
+        while let Some(due) = rig.controller.next_due() {
+            rig.play_to(due);
+            looks += 1;
+            assert!(looks < 1000, "{shift}: stuck at {due}");
+        }
+        assert_eq!(rig.out.words, expected.words);
+    }
+}
+
 #[test]
 fn the_first_tick_is_the_lead_after_start() {
     let mut rig = Rig::new(small_board());

@@ -1,6 +1,8 @@
 //! Slots in flash: power fails at every operation, before, within and after it.
 
-use daic_firmware::slots::{AREA_SECTORS, Flash, PAGE, SECTOR, SlotError, Slots, size};
+use daic_firmware::slots::{AREA_SECTORS, Flash, PAGE, SECTOR, Slots, Stored, autostart, size, tag};
+use daic_protocol::message::{Autostart, SlotError};
+use daic_protocol::program::ProgramBytes;
 
 const COUNT: u8 = 3;
 
@@ -59,22 +61,28 @@ fn program(seed: u8, length: usize) -> Vec<u8> {
     (0..length).map(|i| (i as u8).wrapping_mul(31).wrapping_add(seed)).collect()
 }
 
+fn load(slots: &Slots<Fragile>, slot: u8) -> Result<(Stored, ProgramBytes), SlotError> {
+    let mut program = ProgramBytes::new();
+    let stored = slots.load(slot, &mut program)?;
+    Ok((stored, program))
+}
+
 #[test]
 fn what_is_stored_is_loaded() {
     let mut slots = Slots::new(Fragile::new(), COUNT);
     for slot in 0..COUNT {
-        assert_eq!(slots.load(slot), Err(SlotError::Empty));
+        assert_eq!(load(&slots, slot), Err(SlotError::Empty));
     }
     for (slot, length) in [(0, 1), (1, 16 * 1024), (2, 0), (1, 256), (1, 257)] {
         let bytes = program(slot, length);
         slots.store(slot, &bytes, [slot, 1, 2, 3]).unwrap();
-        let (stored, loaded) = slots.load(slot).unwrap();
+        let (stored, loaded) = load(&slots, slot).unwrap();
         assert_eq!((&loaded[..], stored.tag, stored.length), (&bytes[..], [slot, 1, 2, 3], length as u32));
     }
-    assert_eq!(slots.load(0).unwrap().1[..], program(0, 1), "slots do not touch one another");
+    assert_eq!(load(&slots, 0).unwrap().1[..], program(0, 1), "slots do not touch one another");
     slots.erase(1).unwrap();
-    assert_eq!(slots.load(1), Err(SlotError::Empty));
-    assert_eq!(slots.load(COUNT), Err(SlotError::NoSuchSlot));
+    assert_eq!(load(&slots, 1), Err(SlotError::Empty));
+    assert_eq!(load(&slots, COUNT), Err(SlotError::NoSuchSlot));
     assert_eq!(slots.store(COUNT, &[], [0; 4]), Err(SlotError::NoSuchSlot));
     assert_eq!(slots.erase(COUNT), Err(SlotError::NoSuchSlot));
 }
@@ -106,7 +114,7 @@ fn a_power_failure_leaves_the_old_program_or_the_new() {
         // Power is back.
         let bytes = slots.flash().bytes.clone();
         let mut slots = Slots::new(Fragile { bytes, operations: 0, cut: None, stuck: None }, COUNT);
-        let (stored, loaded) = slots.load(1).unwrap_or_else(|e| panic!("cut {operation} {part}: {e}"));
+        let (stored, loaded) = load(&slots, 1).unwrap_or_else(|e| panic!("cut {operation} {part}: {e:?}"));
         if loaded[..] == new {
             assert_eq!(stored.tag, [2; 4]);
             replaced += 1;
@@ -117,7 +125,7 @@ fn a_power_failure_leaves_the_old_program_or_the_new() {
         }
         // And the slot can be written as ever.
         slots.store(1, &new, [3; 4]).unwrap();
-        assert_eq!(slots.load(1).unwrap().1[..], new);
+        assert_eq!(load(&slots, 1).unwrap().1[..], new);
     }
     // New only if all of the header that counts is written: from half of the last operation on.
     assert_eq!((kept, replaced), (5 * operations - 3, 3));
@@ -134,7 +142,7 @@ fn a_power_failure_while_emptying_never_brings_back_the_program_before() {
         let cut = Some((operation, part));
         let mut slots = Slots::new(Fragile { operations: 0, cut, ..flash.clone() }, COUNT);
         let _ = slots.erase(0);
-        match slots.load(0) {
+        match load(&slots, 0) {
             Ok((_, loaded)) => assert_eq!(loaded[..], new, "cut {operation} {part}"),
             Err(error) => assert_eq!(error, SlotError::Empty),
         }
@@ -151,7 +159,7 @@ fn worn_out_flash_is_noticed_and_the_old_program_stays() {
     for stuck in [area + PAGE + 300, area + 9] {
         slots.flash().stuck = Some(stuck);
         assert_eq!(slots.store(0, &[0; 600], [2; 4]), Err(SlotError::WriteFailed));
-        assert_eq!(slots.load(0).unwrap().1[..], old);
+        assert_eq!(load(&slots, 0).unwrap().1[..], old);
     }
 }
 
@@ -161,6 +169,20 @@ fn many_times() {
     let mut slots = Slots::new(Fragile::new(), 1);
     for n in 0..100u8 {
         slots.store(0, &[n], [n; 4]).unwrap();
-        assert_eq!(slots.load(0).unwrap().1[..], [n]);
+        assert_eq!(load(&slots, 0).unwrap().1[..], [n]);
     }
+}
+
+#[test]
+fn the_list_tells_when_a_program_starts() {
+    let mut slots = Slots::new(Fragile::new(), COUNT);
+    let kinds = [Autostart::Off, Autostart::PowerUp, Autostart::Input { input: 3 }];
+    assert!(slots.list().is_empty());
+    for (slot, kind) in (0u8..).zip(kinds) {
+        assert_eq!(autostart(tag(kind)), kind);
+        slots.store(slot, &program(slot, 100), tag(kind)).unwrap();
+    }
+    slots.erase(1).unwrap();
+    let list: Vec<_> = slots.list().iter().map(|s| (s.slot, s.length, s.autostart)).collect();
+    assert_eq!(list, [(0, 100, kinds[0]), (2, 100, kinds[2])]);
 }

@@ -79,15 +79,18 @@ fn single_instructions() {
         u32::MAX.into(),
         1_000_000_000,
     );
-    refused(&[full_move(1, 0, 1, 1, 5)], 0, Rule::Unsupported, 5, 0);
+    let unsupported = |i: Instruction, value| {
+        let expected = Violation { instruction: 0, rule: Rule::Unsupported, value, limit: 0 };
+        assert_eq!(verdict(&[i], &bare_board()), Err(expected));
+    };
+    unsupported(full_move(1, 0, 1, 1, 5), 5);
     let wait = Instruction::WaitTrigger { input: 0, edge: TriggerEdge::Rising, skip: 0, timeout: 0 };
-    refused(&[wait], 0, Rule::Unsupported, 0, 0);
-    // A board cannot promise more than the firmware plays.
+    unsupported(wait, 0);
+    accepted(&[wait, full_move(1, 0, 1, 1, 5)]);
     let mut board = small_board();
-    board.capabilities = u32::MAX;
     board.axes[0].max_rate = u32::MAX;
-    assert_eq!(verdict(&[wait], &board).unwrap_err().rule, Rule::Unsupported);
-    assert_eq!(verdict(&[full_move(0, 0, 1, 1, 5)], &board).unwrap_err().rule, Rule::Unsupported);
+    board.axes[0].max_jerk = 4;
+    assert_eq!(verdict(&[full_move(0, 0, 1, 1, 5)], &board).unwrap_err().rule, Rule::JerkOutOfRange);
     let limit = i64::from(daic_firmware::motion::MAX_STEP_RATE);
     assert_eq!(verdict(&[full_move(0, 0, 250_001, 1, 0)], &board).unwrap_err().limit, limit);
 }
@@ -212,7 +215,7 @@ fn huge_loops_are_no_work_and_no_overflow() {
 fn agrees_with_brute_force() {
     let board = small_board();
     let (yes, no) = (Cell::new(0), RefCell::new(BTreeMap::<String, u32>::new()));
-    let mut runner = TestRunner::new(random::config(4000));
+    let mut runner = TestRunner::new(random::config(10_000));
     runner
         .run(&random::program(false), |p| {
             let run = naive::play(&p, &board, 1000, [0; 6], 1, 0);
@@ -239,18 +242,59 @@ fn agrees_with_brute_force() {
     }
 }
 
+/// With moves, from any position: what is accepted breaks no rule; what is refused breaks one from some
+/// position, unless the verifier says that it cannot prove it.
+#[test]
+fn with_moves_from_any_position() {
+    let board = small_board();
+    let counts = RefCell::new([0u32; 3]);
+    let mut runner = TestRunner::new(random::config(10_000));
+    runner
+        .run(&(random::program(true), -40i32..=40, -40i32..=40), |(p, x, y)| {
+            let broken = |x: i32, y: i32| naive::play(&p, &board, 1000, [x, y, 0, 0, 0, 0], 1, 0).broken;
+            let which = match verdict(&p, &board) {
+                Ok(()) => {
+                    prop_assert_eq!(broken(x, y), Default::default());
+                    0
+                }
+                Err(v) if v.rule == Rule::CannotProve => 2,
+                Err(v) => {
+                    // Where it is broken: at either end, or where no first move is needed.
+                    let first = |axis: u8| {
+                        let goes = p.iter().find_map(|i| match *i {
+                            Instruction::Move { axis: a, target, .. }
+                            | Instruction::Go { axis: a, target, .. }
+                            | Instruction::Capture { axis: a, target, .. }
+                            | Instruction::Join { axis: a, target }
+                                if a == axis =>
+                            {
+                                Some(target)
+                            }
+                            _ => None,
+                        });
+                        goes.unwrap_or(-40)
+                    };
+                    let places = [(first(0), first(1)), (-40, -40), (40, 40)];
+                    let rule = format!("{:?}", v.rule);
+                    let found = places.iter().any(|&(x, y)| broken(x, y).contains(&rule));
+                    prop_assert!(found, "{v:?} is broken nowhere");
+                    1
+                }
+            };
+            counts.borrow_mut()[which] += 1;
+            Ok(())
+        })
+        .unwrap();
+    let [accepted, refused, unproven] = counts.into_inner();
+    let rate = f64::from(unproven) / f64::from(accepted + refused + unproven);
+    eprintln!("accepted {accepted}, refused {refused}, cannot prove {unproven} ({:.2} %)", 100.0 * rate);
+    // The programs must be of both kinds, or nothing was tested.
+    let all = accepted + refused + unproven;
+    assert!(accepted * 20 > all && refused * 20 > all, "{accepted} {refused}");
+}
+
 proptest! {
     #![proptest_config(random::config(1000))]
-
-    /// With moves, from any position: what is accepted breaks no rule.
-    #[test]
-    fn accepted_programs_break_no_rule(p in random::program(true), x in -40i32..=40, y in -40i32..=40) {
-        let board = small_board();
-        if verdict(&p, &board).is_ok() {
-            let run = naive::play(&p, &board, 1000, [x, y, 0, 0, 0, 0], 1, 0);
-            prop_assert_eq!(run.broken, Default::default());
-        }
-    }
 
     /// Bytes of any kind: a verdict, no panic.
     #[test]

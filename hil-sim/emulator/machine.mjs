@@ -39,6 +39,8 @@ export class Machine {
     /** The player misses the clock in this cycle. */
     this.slip = -1;
     this.boots = 0;
+    /** Machines that only count are not stepped. */
+    this.doze = true;
     this.cut = null;
     this.build(null);
   }
@@ -170,12 +172,27 @@ export class Machine {
       n += this.extra;
       this.extra = 0;
       const { clock } = mcu, [p0, p1] = mcu.pio;
+      // While the flash is busy nothing else goes on: a byte time at once.
+      while (n > 2 * BYTE_TICKS && (p1.stopped || p1.sleeping) && !p0.machines.some((m) => m.enabled)) {
+        n -= BYTE_TICKS;
+        this.cycle += BYTE_TICKS;
+        clock.tick(TICK_NS * BYTE_TICKS);
+        if (p1.sleeping) p1.asleep += BYTE_TICKS;
+        if (this.resetting) break;
+      }
       for (; n > 0; n--) {
         this.cycle++;
         clock.tick(TICK_NS);
-        if (this.arriving.length && this.arriving[0][0] <= this.cycle) mcu.synchronised = this.arriving.shift()[1] >>> 0;
+        if (this.arriving.length && this.arriving[0][0] <= this.cycle) {
+          p1.wake();
+          mcu.synchronised = this.arriving.shift()[1] >>> 0;
+        }
         if (!p0.stopped && this.cycle !== this.slip) p0.tick();
-        if (!p1.stopped) p1.tick();
+        if (p1.sleeping) p1.asleep++;
+        else if (!p1.stopped) {
+          p1.tick();
+          if ((this.cycle & 63) === 0 && this.doze) p1.doze();
+        }
       }
       if (this.resetting) {
         this.resetting = false;

@@ -303,3 +303,36 @@ test('the same stimuli give the same edges', () => {
   };
   assert.equal(edges(), edges());
 });
+
+test('machines that only count are not stepped, and nobody can tell', () => {
+  const PIO1 = 0x50300000;
+  const program = [0x41, 0xc2, 0xa0c1, 0x44, 0x8000, 0x46, 0x47, 0xc6, 0xa0c1, 0x4a, 0x8000, 0x40, 0];
+  const counts = (doze) => {
+    const m = bench();
+    m.doze = doze;
+    program.forEach((word, i) => write(m, PIO1 + 0x48 + 4 * i, word));
+    for (const [machine, gpio] of [[0, 21], [1, 26]]) {
+      const at = PIO1 + 0xc8 + 0x18 * machine;
+      write(m, at + EXECCTRL, (gpio << 24) | (1 << 12));
+      write(m, at + SHIFTCTRL, (1 << 31) | (3 << 18));
+      write(m, at + CLKDIV, 1 << 16);
+      write(m, at + INSTR, 0xa02b); // mov x, ~null
+      write(m, at + INSTR, 0);
+    }
+    write(m, PIO1, 3);
+    const seen = [];
+    let state = 12345;
+    for (let n = 0; n < 200; n++) {
+      state = (Math.imul(state, 1103515245) + 12345) >>> 0;
+      m.run(m.cycle + 1 + (state >>> 8) % 977);
+      m.setInput(state & 1 ? 21 : 26, (state >>> 4) & 1);
+      for (const machine of [0, 1])
+        while (!(m.mcu.readUint32(PIO1 + 4) & (1 << (8 + machine)))) seen.push([machine, m.mcu.readUint32(PIO1 + 0x20 + 4 * machine)]);
+    }
+    seen.push(m.mcu.pio[1].machines.slice(0, 2).map((machine) => (m.mcu.pio[1].wake?.(), machine.x)));
+    return JSON.stringify(seen);
+  };
+  const stepped = counts(false);
+  assert.ok(stepped.length > 1000);
+  assert.equal(counts(true), stepped);
+});

@@ -5,16 +5,18 @@ use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use daic_firmware::{AxisLimits, Board, Controller, LedLimits, Sink};
+use daic_firmware::{AxisLimits, Board, Controller, Homing, LedLimits, Overdrive, Sink};
 use daic_protocol::channels::{AXES, LEDS, SAFE_WORD};
-use daic_protocol::limits::{EVENT_RING, EVENTS_PER_REPLY, TICK_HZ};
-use daic_protocol::message::Capabilities;
+use daic_protocol::limits::{EVENT_RING, EVENTS_PER_REPLY, MAX_SLOTS, TICK_HZ};
+use daic_protocol::message::{Autostart, Capabilities, SlotError, SlotInfo, State};
+use daic_protocol::program::ProgramBytes;
 
-use crate::config::{BoardConfig, ClockMode, FaultsConfig, SimConfig};
+use crate::config::{BoardConfig, ClockMode, FaultsConfig, HomeConfig, OverdriveConfig, SimConfig};
 use crate::hash::mix;
 use crate::record::Record;
+use crate::slots::Slots;
 use crate::transport::Link;
-use crate::world::{ExposureRecord, World};
+use crate::world::{ExposureRecord, Wiring, World};
 
 /// In stepped mode a program is played for so many virtual seconds before the link is polled in between.
 pub const STEPPED_PATIENCE_S: f64 = 60.0;
@@ -56,6 +58,8 @@ pub(crate) struct Shared {
     pub(crate) render: AtomicBool,
     /// New exposure in nanoseconds, 0 for none.
     pub(crate) exposure_ns: AtomicU64,
+    /// New levels of trigger inputs and interlock, `u64::MAX` for none.
+    pub(crate) inputs: AtomicU64,
     /// Exposures ended and not yet turned into frames.
     pub(crate) pending: AtomicU64,
     pub(crate) record: Mutex<Record>,
@@ -70,6 +74,7 @@ impl Shared {
             silent: AtomicBool::new(false),
             render: AtomicBool::new(true),
             exposure_ns: AtomicU64::new(0),
+            inputs: AtomicU64::new(u64::MAX),
             pending: AtomicU64::new(0),
             record: Mutex::default(),
             truth: Mutex::new(Truth {
@@ -101,6 +106,7 @@ pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 struct Wires<'a> {
     world: &'a mut World,
     record: MutexGuard<'a, Record>,
+    slots: &'a mut Slots,
     boot_tick: u64,
 }
 
@@ -115,12 +121,26 @@ impl Sink for Wires<'_> {
         self.world.level(tick, led, level);
         self.record.levels.push((tick, led, level));
     }
+    fn store(&mut self, slot: u8, program: &[u8], autostart: Autostart) -> Result<(), SlotError> {
+        self.slots.store(slot, program, autostart)
+    }
+    fn fetch(&mut self, slot: u8, program: &mut ProgramBytes) -> Result<(), SlotError> {
+        self.slots.fetch(slot, program)
+    }
+    fn erase(&mut self, slot: u8) -> Result<(), SlotError> {
+        self.slots.erase(slot)
+    }
+    fn slots(&mut self) -> heapless::Vec<SlotInfo, MAX_SLOTS> {
+        self.slots.list()
+    }
 }
 
 pub(crate) struct BoardThread {
     config: SimConfig,
     controller: Controller,
     world: World,
+    wiring: Wiring,
+    slots: Slots,
     link: Box<dyn Link>,
     exposures: Sender<ExposureRecord>,
     shared: Arc<Shared>,
@@ -173,6 +193,8 @@ impl BoardThread {
         Self {
             controller: boot(config, 1),
             world: World::new(config),
+            wiring: Wiring::new(&config.board),
+            slots: Slots::new(config.board.slots),
             config: config.clone(),
             link,
             exposures,
@@ -309,15 +331,42 @@ impl BoardThread {
         }
     }
 
-    /// Tick of the controller's next output or event, in simulated time.
+    /// Tick of the next thing that happens by itself, in simulated time: an output or event of the
+    /// controller, or an input that it may be waiting for.
     fn due(&self) -> Option<u64> {
-        self.controller.next_due().map(|tick| self.boot_tick.saturating_add(tick))
+        let output = self.controller.next_due().map(|tick| self.boot_tick.saturating_add(tick));
+        let input = self.wiring.due(&self.world).filter(|_| self.controller.state() == State::Running);
+        output.into_iter().chain(input).min()
     }
 
     fn play_until(&mut self, tick: u64) {
-        let mut wires =
-            Wires { world: &mut self.world, record: lock(&self.shared.record), boot_tick: self.boot_tick };
-        self.controller.play(tick.saturating_sub(self.boot_tick), &mut wires);
+        loop {
+            let next = self.due().map_or(tick, |due| due.min(tick));
+            let mut wires = Wires {
+                world: &mut self.world,
+                record: lock(&self.shared.record),
+                slots: &mut self.slots,
+                boot_tick: self.boot_tick,
+            };
+            let here = next.saturating_sub(self.boot_tick);
+            self.controller.play(here, &mut wires);
+            drop(wires);
+            // Only inputs that something is wired to need the world to keep up.
+            if self.wiring.is_wired() {
+                self.world.advance(next);
+                let word = self.wiring.word(next, &self.world);
+                let mut wires = Wires {
+                    world: &mut self.world,
+                    record: lock(&self.shared.record),
+                    slots: &mut self.slots,
+                    boot_tick: self.boot_tick,
+                };
+                self.controller.inputs(here, word, &mut wires);
+            }
+            if next >= tick {
+                return;
+            }
+        }
     }
 
     /// Gives bytes to the controller and returns what it answers.
@@ -331,6 +380,7 @@ impl BoardThread {
             let mut wires = Wires {
                 world: &mut self.world,
                 record: lock(&self.shared.record),
+                slots: &mut self.slots,
                 boot_tick: self.boot_tick,
             };
             self.controller.receive(self.now - self.boot_tick, bytes, &mut wires, &mut |reply| {
@@ -359,6 +409,10 @@ impl BoardThread {
     }
 
     fn take_commands(&mut self) {
+        let levels = self.shared.inputs.swap(u64::MAX, Ordering::Relaxed);
+        if let Ok(levels) = u32::try_from(levels) {
+            self.wiring.set_levels(levels);
+        }
         let exposure = self.shared.exposure_ns.swap(0, Ordering::Relaxed);
         if exposure > 0 {
             self.world.camera_mut().set_exposure_ns(exposure);
@@ -407,10 +461,24 @@ fn boot(config: &SimConfig, boots: u32) -> Controller {
 }
 
 fn board(config: &BoardConfig) -> Board {
-    // The numbers of axes and LEDs have been checked against the protocol's by validation.
+    // The numbers of axes, LEDs and inputs have been checked against the protocol's by validation.
+    let homing = |h: &HomeConfig| Homing {
+        high_end: h.high_end,
+        rate: h.rate,
+        travel: h.travel,
+        position: h.position,
+    };
+    let row = |o: &OverdriveConfig| Overdrive { above: o.above, max_pulse: o.max_pulse, cycle: o.cycle };
+    let interlock = if config.interlock { Capabilities::INTERLOCK } else { 0 };
     Board {
         name: "hil-sim",
-        capabilities: Capabilities::SIMULATED,
+        capabilities: Capabilities::SIMULATED
+            | Capabilities::TRIGGER_INPUTS
+            | Capabilities::JERK
+            | Capabilities::STREAMING
+            | Capabilities::FLASH
+            | Capabilities::EXPOSURE_ACTIVE
+            | interlock,
         axes: config
             .axes
             .iter()
@@ -420,15 +488,24 @@ fn board(config: &BoardConfig) -> Board {
                 max: a.max,
                 max_rate: a.max_rate,
                 max_acceleration: a.max_acceleration,
+                max_jerk: a.max_jerk,
+                home: a.home.as_ref().map(homing),
             })
             .collect(),
         leds: config
             .leds
             .iter()
             .take(usize::from(LEDS))
-            .map(|l| LedLimits { max_pulse: l.max_pulse, settle: l.settle })
+            .map(|l| LedLimits {
+                max_pulse: l.max_pulse,
+                settle: l.settle,
+                window: l.window,
+                overdrive: l.overdrive.iter().take(4).map(row).collect(),
+            })
             .collect(),
         cameras: config.cameras,
+        inputs: config.inputs,
+        input_latency: config.input_latency,
         start_lead: daic_firmware::START_LEAD,
     }
 }

@@ -23,6 +23,7 @@ pub mod record;
 pub mod rig;
 pub mod scene;
 pub mod sensor;
+mod slots;
 pub mod transport;
 pub mod world;
 

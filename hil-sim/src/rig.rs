@@ -123,6 +123,11 @@ impl SimRig {
         self.shared.exposure_ns.store(ns.max(8), Ordering::Relaxed);
     }
 
+    /// Sets the levels of trigger inputs (bits 0 to 7) and interlock (bit 24, high = closed).
+    pub fn set_inputs(&self, word: u32) {
+        self.shared.inputs.store(u64::from(word), Ordering::Relaxed);
+    }
+
     /// Every word put out so far as (tick, word). Ticks count from the start of the rig, which is
     /// also the first boot of the box.
     pub fn played(&self) -> Vec<(u64, u32)> {

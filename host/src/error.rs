@@ -330,6 +330,14 @@ pub enum Error {
         /// Its one grey level.
         level: u16,
     },
+    /// A program for the box that cannot be read or is too long.
+    #[error("{}: {reason}", path.display())]
+    BoxProgram {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
     /// A file name whose ending says no known format.
     #[error("{} ends in no format that can be written here: use one of {allowed}", path.display())]
     UnknownFormat {

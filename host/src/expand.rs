@@ -145,8 +145,19 @@ pub fn expand(program: &[Instruction], position: [i32; 6]) -> Result<Edges, Expa
             Instruction::Move { axis, target, max_rate, acceleration, jerk: 0 } => {
                 state.travel(axis, target, max_rate, acceleration).ok_or(invalid)?;
             }
-            Instruction::Move { .. } | Instruction::WaitTrigger { .. } => return Err(invalid),
-            Instruction::Level { .. } | Instruction::Mark { .. } => {}
+            Instruction::Move { .. }
+            | Instruction::WaitTrigger { .. }
+            | Instruction::Wait { .. }
+            | Instruction::Join { .. }
+            | Instruction::Go { .. }
+            | Instruction::Reach
+            | Instruction::Home { .. }
+            | Instruction::Capture { .. } => return Err(invalid),
+            Instruction::Level { .. }
+            | Instruction::Mark { .. }
+            | Instruction::Gate { .. }
+            | Instruction::NoGate
+            | Instruction::Policy(_) => {}
             Instruction::Stop => break,
         }
         if state.edges.len() > MAX_EDGES {

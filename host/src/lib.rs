@@ -6,6 +6,7 @@
 //! experiment, acquisition), [`daic_dataset`] (files), [`daic_report`] (figures, HTML).
 //!
 //! * [`measure`]: frames with two views become points and displacements.
+//! * [`box_program`], [`timeline`]: programs of the trigger box, and pictures of them.
 //! * [`recording`]: a run of the rig becomes a dataset.
 //! * [`process`]: a dataset becomes results, summary and report.
 //! * [`pair`]: plain 2D-DIC of two images; [`strain`] and [`probe`] work on its results, [`noise_floor`]
@@ -21,6 +22,7 @@
 
 pub mod align;
 pub mod area;
+pub mod box_program;
 pub mod calibrate_camera;
 pub mod calibrate_distortion;
 pub mod calibrate_rig;
@@ -54,6 +56,7 @@ pub mod settings;
 #[cfg(feature = "sim")]
 pub mod simulated;
 pub mod strain;
+pub mod timeline;
 pub mod usage;
 mod verdicts;
 

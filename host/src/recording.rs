@@ -44,7 +44,8 @@ impl FrameSink for Writer {
     }
 }
 
-fn event_record(event: &Event) -> EventRecord {
+/// An event as it stands in datasets and JSON answers.
+pub fn event_record(event: &Event) -> EventRecord {
     let (kind, data) = match event.kind {
         EventKind::RunStarted { run, program } => ("RunStarted", json!({ "run": run, "program": program })),
         EventKind::Edge { changed, word } => ("Edge", json!({ "changed": changed, "word": word })),
@@ -59,6 +60,19 @@ fn event_record(event: &Event) -> EventRecord {
         EventKind::Faulted { cause, instruction } => {
             ("Faulted", json!({ "cause": format!("{cause:?}"), "instruction": instruction }))
         }
+        EventKind::Triggered { input, missed } => ("Triggered", json!({ "input": input, "missed": missed })),
+        EventKind::TimedOut { input } => ("TimedOut", json!({ "input": input })),
+        EventKind::ExposureBegan { camera, after } => {
+            ("ExposureBegan", json!({ "camera": camera, "after": after }))
+        }
+        EventKind::ExposureEnded { camera, length } => {
+            ("ExposureEnded", json!({ "camera": camera, "length": length }))
+        }
+        EventKind::ExposureMissing { camera, after } => {
+            ("ExposureMissing", json!({ "camera": camera, "after": after }))
+        }
+        EventKind::Homed { axis, correction } => ("Homed", json!({ "axis": axis, "correction": correction })),
+        EventKind::StreamLead { ticks } => ("StreamLead", json!({ "ticks": ticks })),
     };
     EventRecord { seq: event.seq, tick: event.tick, kind: kind.to_owned(), data }
 }

@@ -124,6 +124,7 @@ fn with_rig(mut config: SimConfig, experiment: &Experiment, wavelength_mm: f64) 
             max: (axis.max.mm() * per_mm).ceil() as i32,
             max_rate: (axis.rate.mm_per_s() * per_mm).ceil() as u32,
             max_acceleration: (axis.acceleration.mm_per_s2() * per_mm).ceil() as u32,
+            ..AxisConfig::default()
         });
     }
     config

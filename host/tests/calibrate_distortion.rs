@@ -173,9 +173,9 @@ fn check(scene: &Scene, cross: bool, one_pose: bool, limit: f64) -> Outcome {
     println!("  brown {:?} ± {:?}", found.brown.brown, found.brown.sigma);
     assert!(inside.len() > scene.size[0] * scene.size[1] / 49 / 2, "{}", inside.len());
     assert!(rms(&x) < limit && rms(&y) < limit, "{} {}", rms(&x), rms(&y));
-    // What is left is stated, neither too small nor much too large.
+    // What is left is stated, neither too small nor too large: to a tenth below, to a fifth above.
     for (stated, is) in [(tx, rms(&x)), (ty, rms(&y))] {
-        assert!(stated > 0.9 * is && stated < 3.0 * is, "stated {stated}, is {is}");
+        assert!(stated > 0.9 * is && stated < 1.2 * is, "stated {stated}, is {is}");
     }
     // Where the window leaves the image Brown's terms and smoothness carry the map on.
     assert!(rms(&bx) < 0.02 && rms(&by) < 0.02);
@@ -279,11 +279,11 @@ fn stated_uncertainty_is_the_scatter_of_repeats() {
         let ratio = ratio.map(|r| (r / count[0]).sqrt());
         let border = border.map(|r| (r / count[1]).sqrt());
         println!("cross {cross}: scatter over σ {ratio:.3?} at measured nodes, {border:.3?} in the border");
-        // Measured 0.80 and 0.86 for lines: the carrier takes some of the noise of so small a target with it,
-        // and near the rim σ is widened.
-        assert!(ratio.iter().all(|r| (0.75..1.1).contains(r)), "{ratio:?}");
-        // There σ also holds what the noise does not move: how far the map may stray.
-        assert!(border.iter().all(|r| *r < 1.1), "{border:?}");
+        // A node's variance from 16 repeats is known to √(2/15) = 37 %; windows overlap and the carrier is common, so
+        // some 30 measured nodes and 15 of the border count as independent: 3.3 % and 4.7 % of the root. Three
+        // of these. (With 100 repeats of simulated phases it is 0.97 to 1.01: the optics crate's distortion_noise.)
+        assert!(ratio.iter().all(|r| (r - 1.0).abs() < 0.10), "{ratio:?}");
+        assert!(border.iter().all(|r| (r - 1.0).abs() < 0.14), "{border:?}");
     }
 }
 

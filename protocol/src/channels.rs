@@ -9,6 +9,15 @@
 //! | 12…15   | free auxiliary lines 0…3 |
 //! | 16…27   | axis 0…5: step (even bit, rising edge steps) and direction (odd bit, high = positive) |
 //! | 28…31   | reserved, always low |
+//!
+//! The inputs are one word too:
+//!
+//! | bits    | what |
+//! |---------|------|
+//! | 0…7     | trigger input 0…7 |
+//! | 8…11    | exposure-active line of camera 0…3, high while it is exposed |
+//! | 12…23   | limit switches of axis 0…5: at the low end (even bit) and at the high end (odd bit), high = pressed |
+//! | 24      | interlock, high = closed |
 
 /// Number of LED lines.
 pub const LEDS: u8 = 8;
@@ -24,6 +33,17 @@ pub const AXIS_MASK: u32 = 0x0fff_0000;
 pub const LED_MASK: u32 = 0x0000_00ff;
 /// All camera trigger bits.
 pub const CAMERA_MASK: u32 = 0x0000_0f00;
+
+/// Trigger inputs that a box can have.
+pub const INPUTS: u8 = 8;
+/// All trigger bits of the input word.
+pub const TRIGGER_INPUT_MASK: u32 = 0x0000_00ff;
+/// All exposure-active bits of the input word.
+pub const EXPOSURE_MASK: u32 = 0x0000_0f00;
+/// All limit switch bits of the input word.
+pub const LIMIT_MASK: u32 = 0x00ff_f000;
+/// The interlock's bit of the input word: high = closed, light and motion allowed.
+pub const INTERLOCK: u32 = 0x0100_0000;
 
 /// The word with every output off.
 pub const SAFE_WORD: u32 = 0;
@@ -47,4 +67,16 @@ pub const fn step(index: u8) -> Option<u32> {
 /// Mask of the direction line of axis `index`, or `None` beyond the last.
 pub const fn direction(index: u8) -> Option<u32> {
     if index < AXES { bit(17, index.wrapping_mul(2), AXES * 2) } else { None }
+}
+/// Bit of trigger input `index` in the input word, or `None` beyond the last.
+pub const fn trigger_input(index: u8) -> Option<u32> {
+    bit(0, index, INPUTS)
+}
+/// Bit of the exposure-active line of camera `index` in the input word, or `None` beyond the last.
+pub const fn exposure_active(index: u8) -> Option<u32> {
+    bit(8, index, CAMERAS)
+}
+/// Bit of the limit switch of axis `index` in the input word, or `None` beyond the last.
+pub const fn limit_switch(index: u8, high_end: bool) -> Option<u32> {
+    if index < AXES { bit(12, index.wrapping_mul(2).wrapping_add(high_end as u8), AXES * 2) } else { None }
 }

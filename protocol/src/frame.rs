@@ -27,47 +27,13 @@ pub const MAX_FRAME: usize = MAX_PAYLOAD + MAX_PAYLOAD / 254 + 2;
 pub const VERSION: u8 = PROTOCOL_VERSION as u8;
 const _: () = assert!(PROTOCOL_VERSION < 256, "the header has one byte for the version");
 
-const CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
+pub(crate) static CRC: crc::Crc<u32> = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC);
 
 /// CRC-32/ISO-HDLC (polynomial 0x04c11db7 reflected, initial value and final xor 0xffffffff).
 ///
 /// The check value, that of the nine ASCII bytes `123456789`, is 0xcbf43926.
 pub fn crc32(bytes: &[u8]) -> u32 {
     CRC.checksum(bytes)
-}
-
-/// [`crc32`] of bytes that come in parts.
-pub struct Digest(crc::Digest<'static, u32>);
-
-static TABLE: crc::Crc<u32> = CRC;
-
-impl Default for Digest {
-    fn default() -> Self {
-        Self::new()
-    }
-}
-
-impl core::fmt::Debug for Digest {
-    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        f.write_str("Digest")
-    }
-}
-
-impl Digest {
-    /// Of no bytes yet.
-    pub fn new() -> Self {
-        Self(TABLE.digest())
-    }
-
-    /// More bytes.
-    pub fn update(&mut self, bytes: &[u8]) {
-        self.0.update(bytes);
-    }
-
-    /// Of all of them.
-    pub fn finish(self) -> u32 {
-        self.0.finalize()
-    }
 }
 
 /// What a frame holds.

@@ -32,3 +32,9 @@ pub const TICK_HZ: u32 = 125_000_000;
 
 /// Smallest distance in ticks between two successive words of the player (32 ns).
 pub const MIN_STEP_TICKS: u32 = 4;
+
+/// Bytes of a stream that the box holds: what is not yet played, at most.
+pub const STREAM_BYTES: usize = MAX_PROGRAM_BYTES;
+
+/// Program slots that a box with permanent memory has at most.
+pub const MAX_SLOTS: usize = 8;

@@ -3,13 +3,14 @@
 //! Append-only enums: a variant never changes its place or its fields; `tests/golden.rs` pins the
 //! bytes of each.
 
-use crate::limits::{CHUNK_LEN, EVENTS_PER_REPLY};
+use crate::channels::INPUTS;
+use crate::limits::{CHUNK_LEN, EVENTS_PER_REPLY, MAX_SLOTS};
 use heapless::{String, Vec};
 use serde::{Deserialize, Serialize};
 
 /// Hash (CRC-32/ISO-HDLC) over the golden bytes of all messages, in the order of `tests/golden.rs`,
 /// which computes it anew. A change means that the messages have changed.
-pub const SCHEMA_HASH: u32 = 0x7f93_0e01;
+pub const SCHEMA_HASH: u32 = 0x6bab_7c13;
 
 /// From host to box. The frame header carries the request id.
 // Nothing here can be boxed: there is no allocator.
@@ -61,8 +62,65 @@ pub enum Request {
     },
     /// One clock sample; the reply carries the tick at which the request was received.
     Clock,
+    /// Begin a program that comes while it is played; the box is armed for it. The committed program
+    /// stays where it is.
+    StreamBegin,
+    /// The bytes of the stream at `offset`. What has been received before is ignored, so a repeat
+    /// does no harm; a gap is refused.
+    StreamWrite {
+        /// Absolute: counted from the beginning of the stream.
+        offset: u32,
+        /// Bytes of instructions, cut anywhere.
+        data: Vec<u8, CHUNK_LEN>,
+    },
+    /// The stream is complete.
+    StreamEnd {
+        /// Bytes of the whole stream.
+        length: u32,
+        /// CRC-32 (ISO-HDLC) over the whole stream.
+        hash: u32,
+    },
+    /// How far the stream is.
+    StreamStatus,
+    /// The input word and what was counted on it.
+    Inputs,
+    /// Keep the committed program in a slot of permanent memory.
+    SlotStore {
+        /// Slot number.
+        slot: u8,
+        /// When to start it without a host.
+        autostart: Autostart,
+    },
+    /// Commit the program of a slot; it is verified as if it had been loaded.
+    SlotLoad {
+        /// Slot number.
+        slot: u8,
+    },
+    /// Forget the program of a slot.
+    SlotErase {
+        /// Slot number.
+        slot: u8,
+    },
+    /// What the slots hold.
+    Slots,
+    /// Test the box itself; outputs do not change.
+    SelfTest,
     /// How the board itself is doing.
     Health,
+}
+
+/// When a stored program starts without a host. Append-only.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Autostart {
+    /// Never.
+    Off,
+    /// At power-up.
+    PowerUp,
+    /// At every rising edge of a trigger input, while nothing else is played.
+    Input {
+        /// Trigger input.
+        input: u8,
+    },
 }
 
 /// From box to host. The frame header carries the id of the request answered.
@@ -87,6 +145,14 @@ pub enum Reply {
         /// Tick at which the request's last byte was received.
         tick: u64,
     },
+    /// Answer to `StreamBegin`, `StreamWrite`, `StreamEnd` and `StreamStatus`.
+    Stream(StreamState),
+    /// Answer to `Inputs`.
+    Inputs(Inputs),
+    /// Answer to `Slots`.
+    Slots(Vec<SlotInfo, MAX_SLOTS>),
+    /// Answer to `SelfTest`.
+    SelfTest(SelfTest),
     /// Answer to `Health`.
     Health(Health),
 }
@@ -122,6 +188,95 @@ pub enum ResetCause {
     Panic,
     /// The processor refused an instruction or an access.
     HardFault,
+}
+
+/// How far a stream is. All byte counts are absolute: counted from the beginning of the stream.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StreamState {
+    /// Bytes received.
+    pub received: u32,
+    /// Bytes of instructions that have begun.
+    pub consumed: u32,
+    /// Credit: no byte at or beyond this offset may be sent yet.
+    pub limit: u32,
+    /// Ticks of program still to be played (waits at their shortest).
+    pub lead: u64,
+    /// Smallest lead since the start, taken whenever bytes came in; `u64::MAX` before.
+    pub min_lead: u64,
+    /// Instructions begun.
+    pub instruction: u32,
+    /// Whether the stream is complete.
+    pub ended: bool,
+}
+
+/// The inputs and what was counted on them since boot.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Inputs {
+    /// The input word, see [`channels`](crate::channels).
+    pub word: u32,
+    /// Rising edges of each trigger input.
+    pub rising: [u32; INPUTS as usize],
+    /// Triggers that nothing waited for while a program was played.
+    pub missed: [u32; INPUTS as usize],
+    /// Axes that know where they are, one bit each.
+    pub homed: u8,
+}
+
+/// What a slot holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SlotInfo {
+    /// Slot number.
+    pub slot: u8,
+    /// Bytes of the program.
+    pub length: u32,
+    /// Its hash.
+    pub hash: u32,
+    /// When it starts.
+    pub autostart: Autostart,
+}
+
+/// What the self-test found; bits of [`SelfTests`].
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SelfTest {
+    /// Tests made.
+    pub made: u32,
+    /// Tests failed.
+    pub failed: u32,
+}
+
+/// Bits of [`SelfTest`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SelfTests;
+impl SelfTests {
+    /// CRC-32 of the check string.
+    pub const CRC: u32 = 1;
+    /// The committed program still has its hash.
+    pub const PROGRAM: u32 = 2;
+    /// Step times of a known move.
+    pub const MOTION: u32 = 4;
+    /// The verifier refuses a program that is known to be wrong, and accepts one that is right.
+    pub const VERIFIER: u32 = 8;
+    /// A frame encoded is the frame decoded.
+    pub const FRAMING: u32 = 16;
+    /// Outputs are safe.
+    pub const OUTPUTS: u32 = 32;
+    /// From this bit on: tests of the board itself.
+    pub const BOARD: u32 = 1 << 16;
+}
+
+/// Why permanent memory refused. Append-only.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum SlotError {
+    /// The box has no permanent memory.
+    NoMemory,
+    /// No such slot.
+    NoSuchSlot,
+    /// Nothing is stored there.
+    Empty,
+    /// What is stored there is damaged.
+    Damaged,
+    /// It could not be written.
+    WriteFailed,
 }
 
 /// What the box is and can do. **Frozen for ever**: a host of any version can read it.
@@ -180,6 +335,10 @@ impl Capabilities {
     pub const STREAMING: u32 = 8;
     /// Programs can be stored in flash.
     pub const FLASH: u32 = 16;
+    /// There is an interlock input.
+    pub const INTERLOCK: u32 = 32;
+    /// Exposure-active lines of the cameras are stamped.
+    pub const EXPOSURE_ACTIVE: u32 = 64;
 }
 
 /// State of the controller.
@@ -293,6 +452,48 @@ pub enum Refusal {
     Invalid(Violation),
     /// A request id was used again for another request.
     IdReused,
+    /// No stream has begun.
+    NotStreaming,
+    /// Bytes of the stream are missing before these.
+    StreamGap {
+        /// Offset of the first byte missing.
+        expected: u32,
+        /// Offset given.
+        given: u32,
+    },
+    /// Beyond the credit.
+    StreamFull {
+        /// No byte at or beyond this offset yet.
+        limit: u32,
+        /// End of the bytes given.
+        end: u32,
+    },
+    /// The stream was declared complete, or ends in mid-instruction.
+    StreamEnded {
+        /// Bytes of whole instructions received.
+        length: u32,
+    },
+    /// The interlock is open.
+    InterlockOpen,
+    /// An axis that has a home switch must be homed before it moves.
+    NotHomed {
+        /// Axis.
+        axis: u8,
+    },
+    /// An LED has to cool down.
+    Cooling {
+        /// LED.
+        led: u8,
+        /// Ticks to wait.
+        ticks: u64,
+    },
+    /// Permanent memory refused.
+    Slot {
+        /// Slot.
+        slot: u8,
+        /// Why.
+        error: SlotError,
+    },
 }
 
 /// Which rule a program breaks, where, and by how much.
@@ -355,6 +556,29 @@ pub enum Rule {
     TooLong,
     /// An output is left on when the program ends (`value` = word); only a safe end is allowed.
     LeftOn,
+    /// Whether another rule holds can be neither proven nor refuted within the bounds of the box
+    /// (`value` = number of that rule, `limit` = instructions that were played to find out).
+    CannotProve,
+    /// An LED owes more rest than its window allows (`value` = ticks owed).
+    DutyExceeded,
+    /// Delay of a wait below the latency of the box (`value` = ticks).
+    DelayTooShort,
+    /// Skipping edges makes no sense for a level (`value` = skip).
+    SkipOfLevel,
+    /// A move must end before another begins, before a loop ends, and before the program does.
+    MoveNotEnded,
+    /// `Reach` without a move under way.
+    NothingToReach,
+    /// `Join` without a move after it, or an axis joined twice (`value` = axis).
+    BadJoin,
+    /// Jerk beyond the axis.
+    JerkOutOfRange,
+    /// The axis has no home switch (`value` = axis).
+    NoHomeSwitch,
+    /// A policy that does not end safe (`value` = reaction).
+    BadPolicy,
+    /// Loops cannot be streamed.
+    LoopInStream,
 }
 
 /// Why the box stopped by itself.
@@ -377,8 +601,30 @@ pub enum FaultCause {
     Underrun,
     /// A committed program broke a rule at run time.
     Internal,
-    /// The interlock input does not permit outputs.
+    /// The host has said nothing for the time that the program's policy allows.
+    HostLost,
+    /// The interlock opened.
     Interlock,
+    /// A limit switch was met.
+    LimitSwitch {
+        /// Axis.
+        axis: u8,
+    },
+    /// No trigger came in time.
+    TriggerTimeout {
+        /// Trigger input.
+        input: u8,
+    },
+    /// The home switch was not found, or did not let go.
+    HomingFailed {
+        /// Axis.
+        axis: u8,
+    },
+    /// An LED was about to exceed a limit.
+    LedLimit {
+        /// LED.
+        led: u8,
+    },
     /// The processor did not report in time.
     Heartbeat,
 }
@@ -467,5 +713,50 @@ pub enum EventKind {
         cause: FaultCause,
         /// Instruction being played.
         instruction: u16,
+    },
+    /// A trigger that was waited for; the event's tick is the trigger's.
+    Triggered {
+        /// Trigger input.
+        input: u8,
+        /// Triggers missed on this input since boot.
+        missed: u32,
+    },
+    /// No trigger came in time.
+    TimedOut {
+        /// Trigger input.
+        input: u8,
+    },
+    /// A camera began to expose.
+    ExposureBegan {
+        /// Camera.
+        camera: u8,
+        /// Ticks since its trigger; `u32::MAX` if there was none.
+        after: u32,
+    },
+    /// A camera ended its exposure.
+    ExposureEnded {
+        /// Camera.
+        camera: u8,
+        /// Ticks that it took.
+        length: u32,
+    },
+    /// A camera was triggered and did not expose.
+    ExposureMissing {
+        /// Camera.
+        camera: u8,
+        /// Ticks from that trigger to this event.
+        after: u32,
+    },
+    /// An axis knows where it is.
+    Homed {
+        /// Axis.
+        axis: u8,
+        /// Steps by which the count was wrong.
+        correction: i32,
+    },
+    /// A streamed run ended with this smallest lead.
+    StreamLead {
+        /// Ticks.
+        ticks: u64,
     },
 }

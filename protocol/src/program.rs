@@ -2,9 +2,10 @@
 //!
 //! A program is a header-less sequence of postcard-encoded [`Instruction`]s. It is loaded with
 //! begin → chunk → commit, validated as a whole, and played on one timeline: `Edge`, `Delay`,
-//! `Settle` and `Move` take time, everything else takes none.
+//! `Settle`, `Move`, `Wait`, `WaitTrigger`, `Reach`, `Home` and `Capture` take time, everything else
+//! takes none.
 
-use crate::frame::{TooLarge, crc32};
+use crate::frame::{CRC, TooLarge, crc32};
 use crate::limits::MAX_PROGRAM_BYTES;
 use serde::{Deserialize, Serialize};
 
@@ -33,7 +34,8 @@ pub enum Instruction {
     },
     /// End of the innermost loop.
     LoopEnd,
-    /// Wait for an edge on a trigger input. Encoded now, played by a later firmware.
+    /// Wait for an edge on a trigger input: [`Instruction::Wait`] with the smallest delay that the
+    /// box allows, and a fault when time runs out.
     WaitTrigger {
         /// Input index.
         input: u8,
@@ -76,6 +78,145 @@ pub enum Instruction {
     },
     /// End the program: outputs go to the safe word. Also implied after the last instruction.
     Stop,
+    /// Wait for a trigger; ends exactly `delay` ticks after it.
+    Wait {
+        /// Trigger input.
+        input: u8,
+        /// What counts as a trigger.
+        condition: Condition,
+        /// Edges to let pass before the one that counts; 0 for levels.
+        skip: u32,
+        /// From the trigger to the end of the instruction; at least the latency of the box.
+        delay: u32,
+        /// Give up after this many ticks; 0 waits for ever.
+        timeout: u32,
+        /// What then.
+        on_timeout: Timeout,
+    },
+    /// From here on triggers count only while a gate input has the level given.
+    Gate {
+        /// Trigger input used as a gate.
+        input: u8,
+        /// Level that lets triggers through.
+        open_high: bool,
+    },
+    /// From here on every trigger counts.
+    NoGate,
+    /// Another axis for the move that follows: all axes of a move start and end together, and the
+    /// steps of those that have fewer fall on steps of the one that has most.
+    Join {
+        /// Axis index.
+        axis: u8,
+        /// Absolute target in steps from home.
+        target: i32,
+    },
+    /// Like [`Instruction::Move`], but the program goes on at once; [`Instruction::Reach`] waits for
+    /// the end. Edges in between keep their ticks, steps make way by a few ticks.
+    Go {
+        /// Axis index.
+        axis: u8,
+        /// Absolute target in steps from home.
+        target: i32,
+        /// Highest rate in steps per second.
+        max_rate: u32,
+        /// Acceleration in steps per second squared.
+        acceleration: u32,
+        /// Jerk limit in steps per second cubed; 0 plans a trapezoid.
+        jerk: u32,
+    },
+    /// Wait until the move begun by [`Instruction::Go`] has ended.
+    Reach,
+    /// Find the limit switch of an axis and count from there.
+    Home {
+        /// Axis index.
+        axis: u8,
+    },
+    /// Move, settle, trigger the camera, strobe: one thing that is done whole or not at all.
+    Capture {
+        /// Axis index.
+        axis: u8,
+        /// Absolute target in steps from home.
+        target: i32,
+        /// Highest rate in steps per second.
+        max_rate: u32,
+        /// Acceleration in steps per second squared.
+        acceleration: u32,
+        /// Jerk limit in steps per second cubed; 0 plans a trapezoid.
+        jerk: u32,
+        /// From the end of the move to the camera's trigger.
+        settle: u32,
+        /// Camera trigger lines, a subset of [`CAMERA_MASK`](crate::channels::CAMERA_MASK).
+        cameras: u32,
+        /// LED lines, a subset of [`LED_MASK`](crate::channels::LED_MASK).
+        leds: u32,
+        /// From the camera's trigger to light on.
+        lead: u32,
+        /// How long the light is on.
+        pulse: u32,
+        /// From light off to the end of the camera's trigger, which ends the instruction.
+        hold: u32,
+    },
+    /// What to do when something goes wrong, from here on. Without it: [`Policy::DEFAULT`].
+    Policy(Policy),
+}
+
+/// What to do when something goes wrong. Every way but [`Reaction::Continue`] ends in the safe state,
+/// faulted, with tick, instruction and cause.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Policy {
+    /// The host is lost when it has said nothing for so many milliseconds; 0: never.
+    pub host_timeout_ms: u32,
+    /// The host is lost.
+    pub host_loss: Reaction,
+    /// The interlock opens; [`Reaction::Continue`] is not allowed.
+    pub interlock: Reaction,
+    /// A stream runs dry; [`Reaction::Continue`] is not allowed.
+    pub underrun: Reaction,
+}
+
+impl Policy {
+    /// No host is needed; everything else goes safe at once.
+    pub const DEFAULT: Self = Self {
+        host_timeout_ms: 0,
+        host_loss: Reaction::Continue,
+        interlock: Reaction::Safe,
+        underrun: Reaction::Safe,
+    };
+}
+
+/// A way to react. Append-only.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Reaction {
+    /// Outputs safe at once.
+    Safe,
+    /// Lights and camera triggers off at once, a move under way is finished, then outputs safe.
+    FinishMove,
+    /// Go on as if nothing had happened.
+    Continue,
+}
+
+/// What counts as a trigger. Append-only.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Condition {
+    /// Low to high.
+    Rising,
+    /// High to low.
+    Falling,
+    /// High, also if it is so already.
+    High,
+    /// Low, also if it is so already.
+    Low,
+}
+
+/// What to do when no trigger came in time. Append-only.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Timeout {
+    /// Outputs safe, faulted.
+    Fault,
+    /// Go on with the next instruction, at the tick at which time ran out.
+    Continue,
+    /// End the program as [`Instruction::Stop`] does.
+    Stop,
 }
 
 /// Edge of a trigger input.
@@ -87,8 +228,8 @@ pub enum TriggerEdge {
     Falling,
 }
 
-/// Longest encoding of one instruction in bytes (`Move`: 1 + 1 + 5 + 5 + 5 + 5).
-pub const MAX_INSTRUCTION_BYTES: usize = 22;
+/// Longest encoding of one instruction in bytes (`Capture`: 2 + 10 · 5).
+pub const MAX_INSTRUCTION_BYTES: usize = 52;
 
 /// An encoded program.
 pub type ProgramBytes = heapless::Vec<u8, MAX_PROGRAM_BYTES>;
@@ -171,4 +312,37 @@ impl Iterator for Decode<'_> {
 /// Hash of an encoded program: its CRC-32/ISO-HDLC.
 pub fn hash(bytes: &[u8]) -> u32 {
     crc32(bytes)
+}
+
+/// The same hash of a program that comes in pieces.
+#[derive(Clone)]
+pub struct Hasher(crc::Digest<'static, u32>);
+
+impl Hasher {
+    /// Of nothing yet.
+    pub fn new() -> Self {
+        Self(CRC.digest())
+    }
+
+    /// Adds the next piece.
+    pub fn update(&mut self, bytes: &[u8]) {
+        self.0.update(bytes);
+    }
+
+    /// The hash of all pieces so far.
+    pub fn finish(&self) -> u32 {
+        self.0.clone().finalize()
+    }
+}
+
+impl Default for Hasher {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl core::fmt::Debug for Hasher {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        write!(f, "Hasher({:#010x})", self.finish())
+    }
 }

@@ -8,7 +8,9 @@
 use daic_protocol::frame::{Decoder, Fed, MAX_FRAME, crc32, encode_reply, encode_request};
 use daic_protocol::limits::*;
 use daic_protocol::message::*;
-use daic_protocol::program::{self, Instruction, MAX_INSTRUCTION_BYTES, TriggerEdge};
+use daic_protocol::program::{
+    self, Condition, Instruction, MAX_INSTRUCTION_BYTES, Policy, Reaction, Timeout, TriggerEdge,
+};
 use serde::{Serialize, de::DeserializeOwned};
 use std::fmt::Debug;
 
@@ -48,7 +50,8 @@ fn check<T: Serialize + DeserializeOwned + PartialEq + Debug>(list: &[(T, &str)]
 }
 
 fn requests() -> Vec<(Request, &'static str)> {
-    let data = [0, 1, 0xff].into_iter().collect();
+    let data: heapless::Vec<u8, CHUNK_LEN> = [0, 1, 0xff].into_iter().collect();
+    let stream = data.clone();
     vec![
         (Request::Hello, "00"),
         (Request::Status, "01"),
@@ -63,7 +66,17 @@ fn requests() -> Vec<(Request, &'static str)> {
         (Request::ClearFault, "0a"),
         (Request::ReadEvents { from: 256 }, "0b 80 02"),
         (Request::Clock, "0c"),
-        (Request::Health, "0d"),
+        (Request::StreamBegin, "0d"),
+        (Request::StreamWrite { offset: 300, data: stream }, "0e ac 02 03 00 01 ff"),
+        (Request::StreamEnd { length: 481, hash: 0xdead_beef }, "0f e1 03 ef fd b6 f5 0d"),
+        (Request::StreamStatus, "10"),
+        (Request::Inputs, "11"),
+        (Request::SlotStore { slot: 2, autostart: Autostart::Input { input: 1 } }, "12 02 02 01"),
+        (Request::SlotLoad { slot: 2 }, "13 02"),
+        (Request::SlotErase { slot: 2 }, "14 02"),
+        (Request::Slots, "15"),
+        (Request::SelfTest, "16"),
+        (Request::Health, "17"),
     ]
 }
 
@@ -106,6 +119,18 @@ fn status() -> Status {
 fn replies() -> Vec<(Reply, &'static str)> {
     let event = Event { seq: 5, tick: 1000, kind: EventKind::Mark { id: 3 } };
     let events = Events { oldest: 5, next: 6, dropped: 2, events: [event].into_iter().collect() };
+    let stream = StreamState {
+        received: 481,
+        consumed: 128,
+        limit: 16_512,
+        lead: 300,
+        min_lead: u64::MAX,
+        instruction: 7,
+        ended: true,
+    };
+    let mut inputs = Inputs { word: 0x0100_0001, homed: 5, ..Inputs::default() };
+    (inputs.rising[0], inputs.missed[1]) = (1, 128);
+    let slot = SlotInfo { slot: 2, length: 481, hash: 0xdead_beef, autostart: Autostart::PowerUp };
     let nothing = Status { state: State::Empty, program: None, fault: None, position: [0; 6], ..status() };
     vec![
         (
@@ -126,6 +151,10 @@ fn replies() -> Vec<(Reply, &'static str)> {
         (Reply::Refused(Refusal::IdReused), "03 09"),
         (Reply::Events(events), "04 05 06 02 01 05 e8 07 03 03"),
         (Reply::Clock { tick: u64::MAX }, "05 ff ff ff ff ff ff ff ff ff 01"),
+        (Reply::Stream(stream), "06 e1 03 80 01 80 81 01 ac 02 ff ff ff ff ff ff ff ff ff 01 07 01"),
+        (Reply::Inputs(inputs), "07 81 80 80 08 01 00 00 00 00 00 00 00 00 80 01 00 00 00 00 00 00 05"),
+        (Reply::Slots([slot].into_iter().collect()), "08 01 02 e1 03 ef fd b6 f5 0d 01"),
+        (Reply::SelfTest(SelfTest { made: 0x1_003f, failed: 2 }), "09 bf 80 04 02"),
         (
             Reply::Health(Health {
                 reset: ResetCause::Watchdog,
@@ -136,7 +165,7 @@ fn replies() -> Vec<(Reply, &'static str)> {
                 lead: 1_250_000,
                 turn: 128,
             }),
-            "06 01 c0 9a 0c a8 46 01 02 d0 a5 4c 80 01",
+            "0a 01 c0 9a 0c a8 46 01 02 d0 a5 4c 80 01",
         ),
     ]
 }
@@ -159,6 +188,14 @@ fn refusals() -> Vec<(Refusal, &'static str)> {
         (Refusal::HashDiffers { computed: 1, given: 2 }, "07 01 02"),
         (Refusal::Invalid(violation), "08 03 13 7a 78"),
         (Refusal::IdReused, "09"),
+        (Refusal::NotStreaming, "0a"),
+        (Refusal::StreamGap { expected: 1, given: 2 }, "0b 01 02"),
+        (Refusal::StreamFull { limit: 1, end: 2 }, "0c 01 02"),
+        (Refusal::StreamEnded { length: 3 }, "0d 03"),
+        (Refusal::InterlockOpen, "0e"),
+        (Refusal::NotHomed { axis: 2 }, "0f 02"),
+        (Refusal::Cooling { led: 1, ticks: 300 }, "10 01 ac 02"),
+        (Refusal::Slot { slot: 2, error: SlotError::Damaged }, "11 02 03"),
     ]
 }
 
@@ -187,6 +224,17 @@ fn rules() -> Vec<(Violation, &'static str)> {
         at(Rule::PulseTooLong, "00 13 01 02"),
         at(Rule::TooLong, "00 14 01 02"),
         at(Rule::LeftOn, "00 15 01 02"),
+        at(Rule::CannotProve, "00 16 01 02"),
+        at(Rule::DutyExceeded, "00 17 01 02"),
+        at(Rule::DelayTooShort, "00 18 01 02"),
+        at(Rule::SkipOfLevel, "00 19 01 02"),
+        at(Rule::MoveNotEnded, "00 1a 01 02"),
+        at(Rule::NothingToReach, "00 1b 01 02"),
+        at(Rule::BadJoin, "00 1c 01 02"),
+        at(Rule::JerkOutOfRange, "00 1d 01 02"),
+        at(Rule::NoHomeSwitch, "00 1e 01 02"),
+        at(Rule::BadPolicy, "00 1f 01 02"),
+        at(Rule::LoopInStream, "00 20 01 02"),
     ]
 }
 
@@ -195,8 +243,13 @@ fn causes() -> Vec<(FaultCause, &'static str)> {
         (FaultCause::Aborted, "00"),
         (FaultCause::Underrun, "01"),
         (FaultCause::Internal, "02"),
-        (FaultCause::Interlock, "03"),
-        (FaultCause::Heartbeat, "04"),
+        (FaultCause::HostLost, "03"),
+        (FaultCause::Interlock, "04"),
+        (FaultCause::LimitSwitch { axis: 1 }, "05 01"),
+        (FaultCause::TriggerTimeout { input: 2 }, "06 02"),
+        (FaultCause::HomingFailed { axis: 3 }, "07 03"),
+        (FaultCause::LedLimit { led: 4 }, "08 04"),
+        (FaultCause::Heartbeat, "09"),
     ]
 }
 
@@ -207,6 +260,28 @@ fn resets() -> Vec<(ResetCause, &'static str)> {
         (ResetCause::Panic, "02"),
         (ResetCause::HardFault, "03"),
     ]
+}
+
+fn autostarts() -> Vec<(Autostart, &'static str)> {
+    vec![(Autostart::Off, "00"), (Autostart::PowerUp, "01"), (Autostart::Input { input: 1 }, "02 01")]
+}
+
+fn slot_errors() -> Vec<(SlotError, &'static str)> {
+    use SlotError::*;
+    vec![(NoMemory, "00"), (NoSuchSlot, "01"), (Empty, "02"), (Damaged, "03"), (WriteFailed, "04")]
+}
+
+fn conditions() -> Vec<(Condition, &'static str)> {
+    use Condition::*;
+    vec![(Rising, "00"), (Falling, "01"), (High, "02"), (Low, "03")]
+}
+
+fn timeouts() -> Vec<(Timeout, &'static str)> {
+    vec![(Timeout::Fault, "00"), (Timeout::Continue, "01"), (Timeout::Stop, "02")]
+}
+
+fn reactions() -> Vec<(Reaction, &'static str)> {
+    vec![(Reaction::Safe, "00"), (Reaction::FinishMove, "01"), (Reaction::Continue, "02")]
 }
 
 fn events() -> Vec<(Event, &'static str)> {
@@ -221,11 +296,21 @@ fn events() -> Vec<(Event, &'static str)> {
         at(EventKind::Settled, "01 02 06"),
         at(EventKind::RunDone { run: 3, words: 4, events: 5 }, "01 02 07 03 04 05"),
         at(EventKind::Faulted { cause: FaultCause::Aborted, instruction: 6 }, "01 02 08 00 06"),
+        at(EventKind::Triggered { input: 1, missed: 2 }, "01 02 09 01 02"),
+        at(EventKind::TimedOut { input: 1 }, "01 02 0a 01"),
+        at(EventKind::ExposureBegan { camera: 1, after: 300 }, "01 02 0b 01 ac 02"),
+        at(EventKind::ExposureEnded { camera: 1, length: 300 }, "01 02 0c 01 ac 02"),
+        at(EventKind::ExposureMissing { camera: 1, after: 300 }, "01 02 0d 01 ac 02"),
+        at(EventKind::Homed { axis: 2, correction: -3 }, "01 02 0e 02 05"),
+        at(EventKind::StreamLead { ticks: 300 }, "01 02 0f ac 02"),
     ]
 }
 
 fn instructions() -> Vec<(Instruction, &'static str)> {
-    use Instruction::*;
+    use Instruction::{
+        Capture, Delay, Edge, Gate, Go, Home, Join, Level, LoopBegin, LoopEnd, Mark, Move, NoGate, Reach,
+        Settle, Stop, Wait, WaitTrigger,
+    };
     vec![
         (Edge { mask: 0x103, value: 0x101, after: 125_000 }, "00 83 02 81 02 c8 d0 07"),
         (Delay { ticks: 127 }, "01 7f"),
@@ -241,6 +326,51 @@ fn instructions() -> Vec<(Instruction, &'static str)> {
         (Level { led: 3, level: 40_000 }, "07 03 c0 b8 02"),
         (Mark { id: 258 }, "08 82 02"),
         (Stop, "09"),
+        (
+            Wait {
+                input: 1,
+                condition: Condition::Falling,
+                skip: 2,
+                delay: 128,
+                timeout: 3,
+                on_timeout: Timeout::Stop,
+            },
+            "0a 01 01 02 80 01 03 02",
+        ),
+        (Gate { input: 1, open_high: true }, "0b 01 01"),
+        (NoGate, "0c"),
+        (Join { axis: 1, target: -192 }, "0d 01 ff 02"),
+        (
+            Go { axis: 1, target: -192, max_rate: 64_000, acceleration: 2_000_000, jerk: 5 },
+            "0e 01 ff 02 80 f4 03 80 89 7a 05",
+        ),
+        (Reach, "0f"),
+        (Home { axis: 2 }, "10 02"),
+        (
+            Capture {
+                axis: 1,
+                target: -192,
+                max_rate: 64_000,
+                acceleration: 2_000_000,
+                jerk: 0,
+                settle: 128,
+                cameras: 0x100,
+                leds: 1,
+                lead: 5,
+                pulse: 127,
+                hold: 6,
+            },
+            "11 01 ff 02 80 f4 03 80 89 7a 00 80 01 80 02 01 05 7f 06",
+        ),
+        (
+            Instruction::Policy(Policy {
+                host_timeout_ms: 1000,
+                host_loss: Reaction::Safe,
+                interlock: Reaction::FinishMove,
+                underrun: Reaction::Safe,
+            }),
+            "12 e8 07 00 01 00",
+        ),
     ]
 }
 
@@ -253,9 +383,14 @@ fn every_message_has_its_bytes() {
         check(&refusals(), &[]),
         check(&rules(), &[0]),
         check(&causes(), &[]),
-        check(&resets(), &[]),
         check(&events(), &[1, 2]),
         check(&instructions(), &[]),
+        check(&autostarts(), &[]),
+        check(&slot_errors(), &[]),
+        check(&conditions(), &[]),
+        check(&timeouts(), &[]),
+        check(&reactions(), &[]),
+        check(&resets(), &[]),
     ];
     let hash = crc32(&lists.concat());
     assert_eq!(hash, SCHEMA_HASH, "the messages have changed: the schema hash is now {hash:#010x}");
@@ -358,12 +493,18 @@ fn programs_are_streams_of_instructions() {
     let got: Vec<_> = program::decode(&broken).collect();
     assert_eq!(got, [(0, Ok(Instruction::Delay { ticks: 300 })), (3, Err(program::Undecodable))]);
 
-    let longest = Instruction::Move {
+    let longest = Instruction::Capture {
         axis: u8::MAX,
         target: i32::MIN,
         max_rate: u32::MAX,
         acceleration: u32::MAX,
         jerk: u32::MAX,
+        settle: u32::MAX,
+        cameras: u32::MAX,
+        leds: u32::MAX,
+        lead: u32::MAX,
+        pulse: u32::MAX,
+        hold: u32::MAX,
     };
     assert_eq!(program::encode_instruction(&longest).len(), MAX_INSTRUCTION_BYTES);
     let fits = MAX_PROGRAM_BYTES / MAX_INSTRUCTION_BYTES;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 /// Flash that program and constants may take.
-const MAX_FLASH: u32 = 160 * 1024;
+const MAX_FLASH: u32 = 224 * 1024;
 /// RAM that variables may take: more than 100 KiB stay for the stack.
 const MAX_RAM: u32 = 160 * 1024;
 /// Panics that may be reached from somewhere in the image, by what the symbol's name begins with. None of

@@ -4,6 +4,7 @@
 //! and what could not be run on this machine, with the reason.
 
 mod bench;
+mod campaign;
 mod datasheet;
 mod firmware;
 mod hil;
@@ -19,6 +20,8 @@ cargo xtask COMMAND
   firmware   the Pico's image as ELF and UF2, in target/firmware/
   hil        [--target inprocess|pty|pico] [--port PORT] [--long] [--filter TEXT]: the same cases on the
              controller, on the simulated board, on the emulated Pico, on the board at PORT
+             --faults N: N more runs of the fault campaign; totals in docs/campaigns/faults.json
+             --verifier [--long]: 10 000 (1 000 000) random programs through the verifier
   lint       formatting, clippy, documentation without warnings, cargo-deny where installed
   ci         test, then lint
   datasheet  measures on the emulated Pico and writes the numbers into docs/datasheet.md
@@ -48,10 +51,15 @@ fn main() -> ExitCode {
             report
         }
         ["datasheet"] => hil::datasheet(),
-        ["hil", ..] => hil::hil(&words[1..]),
         ["figures"] => steps::figures(),
         ["coverage"] => steps::coverage(),
         ["reproduce", chapter @ ("macro" | "micro")] => steps::reproduce(chapter),
+        ["hil", "--faults", count] if count.parse::<u64>().is_ok() => {
+            campaign::faults(count.parse().unwrap_or(0))
+        }
+        ["hil", "--verifier"] => campaign::verifier(10_000),
+        ["hil", "--verifier", "--long"] => campaign::verifier(1_000_000),
+        ["hil", ..] => hil::hil(&words[1..]),
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),
         ["bench", "optics"] => steps::bench_optics(),

@@ -1,17 +1,24 @@
 //! What a stretch of instructions asks of its neighbours.
 
-use super::{MAX_RUN_TICKS, int, violation};
-use crate::board::LedLimits;
+use super::checker::Span;
+use super::{FOREVER, MAX_RUN_TICKS, int, violation};
 use crate::outputs::LEDS;
 use daic_protocol::channels;
 use daic_protocol::limits::MIN_STEP_TICKS;
 use daic_protocol::message::{Rule, Violation};
 
-/// Limits that show only between instructions.
-#[derive(Clone, Copy)]
-pub(super) struct Limits<'a> {
-    pub(super) leds: &'a [LedLimits],
+/// Limits of an LED that show only between instructions, at the highest level the program uses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Limit {
+    pub(super) max_pulse: u32,
+    /// Ticks of cycle that a tick of light costs.
+    pub(super) cycle: u32,
+    pub(super) settle: u32,
+    pub(super) window: u32,
 }
+
+/// One per LED; LEDs that are not there have limits that nothing meets.
+pub(super) type Limits = [Limit; LEDS];
 
 /// A tick counted from the beginning of the block, and the instruction that acts there.
 type At = (u64, u16);
@@ -29,6 +36,69 @@ struct Led {
     off: Option<At>,
     /// If the LED was off at the beginning and is on at the end: the longest time it has been on.
     lit: Option<u64>,
+    /// Rest owed, if the LED was off at the beginning, and if it was on.
+    debt: [Debt; 2],
+}
+
+/// What a stretch makes of the rest owed at its beginning: b becomes max(b + gain, floor), and on the way it is
+/// at most max(b + peak_gain, peak_floor).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Debt {
+    gain: i64,
+    floor: i64,
+    peak_gain: i64,
+    peak_floor: i64,
+}
+
+/// Beyond every sum that is told apart.
+const HUGE: i64 = 1 << 62;
+
+fn clamp(value: i64) -> i64 {
+    value.clamp(-HUGE, HUGE)
+}
+
+fn add(a: i64, b: i64) -> i64 {
+    clamp(a.saturating_add(b))
+}
+
+impl Debt {
+    const NONE: Self = Self { gain: 0, floor: 0, peak_gain: -HUGE, peak_floor: -HUGE };
+
+    /// Darkness of at least `ticks` pays back.
+    fn dark(ticks: u64) -> Self {
+        Self { gain: clamp(int(ticks).saturating_neg()), ..Self::NONE }
+    }
+
+    /// Light of at most `ticks` costs.
+    fn light(ticks: u64, cycle: u32) -> Self {
+        let gain = clamp(int(ticks).saturating_mul(i64::from(cycle.saturating_sub(1))));
+        Self { gain, peak_gain: gain, ..Self::NONE }
+    }
+
+    fn then(self, next: Self) -> Self {
+        Self {
+            gain: add(self.gain, next.gain),
+            floor: add(self.floor, next.gain).max(next.floor),
+            peak_gain: self.peak_gain.max(add(self.gain, next.peak_gain)),
+            peak_floor: self.peak_floor.max(add(self.floor, next.peak_gain)).max(next.peak_floor),
+        }
+    }
+
+    /// `again` + 1 times over.
+    fn repeat(self, again: u32) -> Self {
+        let times = |n: u32| clamp(self.gain.saturating_mul(i64::from(n))).max(0);
+        let last = self.floor.saturating_add(times(again.saturating_sub(1)));
+        Self {
+            gain: clamp(self.gain.saturating_mul(i64::from(again).saturating_add(1))),
+            floor: add(self.floor, times(again)),
+            peak_gain: add(self.peak_gain, times(again)),
+            peak_floor: if again == 0 {
+                self.peak_floor
+            } else {
+                self.peak_floor.max(add(last, self.peak_gain))
+            },
+        }
+    }
 }
 
 /// A stretch of instructions.
@@ -49,9 +119,11 @@ pub(super) struct Block {
     leds: [Led; LEDS],
 }
 
-const UNTOUCHED: Led = Led { on: None, level: None, level_first: None, off: None, lit: None };
+const UNTOUCHED: Led =
+    Led { on: None, level: None, level_first: None, off: None, lit: None, debt: [Debt::NONE; 2] };
 
-/// Shortest times are never above longest ones, and those are checked against [`MAX_RUN_TICKS`].
+/// Shortest times are never above longest ones, and those are checked against [`MAX_RUN_TICKS`] or
+/// [`FOREVER`].
 fn plus(a: u64, b: u64) -> u64 {
     a.saturating_add(b)
 }
@@ -61,6 +133,14 @@ fn earlier(a: Option<u64>, b: Option<u64>) -> Option<u64> {
         (Some(a), Some(b)) => Some(a.min(b)),
         (a, b) => a.or(b),
     }
+}
+
+/// A sum of longest times.
+fn longest(a: u64, b: u64, index: u16) -> Result<u64, Violation> {
+    if a == FOREVER || b == FOREVER {
+        return Ok(FOREVER);
+    }
+    bounded(a.checked_add(b), index)
 }
 
 fn bounded(ticks: Option<u64>, index: u16) -> Result<u64, Violation> {
@@ -82,7 +162,7 @@ impl Block {
         leds: [UNTOUCHED; LEDS],
     };
 
-    pub(super) fn edge(index: u16, mask: u32, value: u32, after: u32) -> Self {
+    pub(super) fn edge(index: u16, mask: u32, value: u32, after: u32, limits: &Limits) -> Self {
         let ticks = u64::from(after);
         let mut block = Self {
             low: ticks,
@@ -94,6 +174,7 @@ impl Block {
             value,
             ..Self::EMPTY
         };
+        block.spend((ticks, ticks), limits);
         for (led, l) in (0u8..).zip(&mut block.leds) {
             let bit = channels::led(led).unwrap_or(0);
             if mask & value & bit != 0 {
@@ -105,22 +186,33 @@ impl Block {
         block
     }
 
-    pub(super) fn pause(ticks: u32) -> Self {
-        let ticks = u64::from(ticks);
-        Self { low: ticks, high: ticks, silent: Some(ticks), ..Self::EMPTY }
+    /// Nothing for `low` … `high` ticks.
+    pub(super) fn pause((low, high): Span, limits: &Limits) -> Self {
+        let mut block = Self { low, high, silent: Some(low), ..Self::EMPTY };
+        block.spend((low, high), limits);
+        block
     }
 
-    /// A move that takes `low` … `high` ticks, 0 only without steps; its first word comes after `lead`.
-    pub(super) fn motion(index: u16, low: u64, high: u64, lead: u64) -> Self {
+    /// A move that takes `low` … `high` ticks, 0 only without steps; its first word comes after `lead`, its
+    /// last `tail` before the end.
+    pub(super) fn motion(index: u16, (low, high): Span, lead: u64, tail: u64, limits: &Limits) -> Self {
         let moves = high > 0;
-        Self {
+        let mut block = Self {
             low,
             high,
             first: moves.then_some((lead, index)),
-            // The last word is the end of the last step pulse, and that ends the move.
-            last: moves.then_some(0),
+            last: moves.then_some(tail),
             silent: (low == 0).then_some(0),
             ..Self::EMPTY
+        };
+        block.spend((low, high), limits);
+        block
+    }
+
+    /// Rest owed over a time in which no LED changes.
+    fn spend(&mut self, (low, high): Span, limits: &Limits) {
+        for (led, limit) in self.leds.iter_mut().zip(limits) {
+            led.debt = [Debt::dark(low), Debt::light(high, limit.cycle)];
         }
     }
 
@@ -137,21 +229,46 @@ impl Block {
         self.low == 0
     }
 
+    /// Shortest and longest duration.
+    pub(super) fn span(&self) -> Span {
+        (self.low, self.high)
+    }
+
+    /// The LED that owes too much rest if nothing was owed at the beginning and all were off: what it
+    /// owes, and its window.
+    pub(super) fn overdrawn(&self, limits: &Limits) -> Option<(i64, i64)> {
+        let owed = self.leds.iter().zip(limits).map(|(led, limit)| {
+            let [dark, _] = led.debt;
+            (dark.peak_gain.max(dark.peak_floor), i64::from(limit.window))
+        });
+        owed.filter(|(owed, window)| owed > window).max()
+    }
+
     /// Lines that are on at the end if all were off at the beginning.
     pub(super) fn left_on(&self) -> u32 {
         self.mask & self.value
     }
 
     /// This block, then `next`, which ends with instruction `end`.
-    pub(super) fn then(&mut self, next: &Self, end: u16, limits: Limits<'_>) -> Result<(), Violation> {
+    pub(super) fn then(&mut self, next: &Self, end: u16, limits: &Limits) -> Result<(), Violation> {
         if let (Some(last), Some((first, index))) = (self.last, next.first) {
             let distance = plus(last, first);
             if distance < u64::from(MIN_STEP_TICKS) {
                 return Err(violation(index, Rule::StepTooShort, int(distance), i64::from(MIN_STEP_TICKS)));
             }
         }
-        for ((led, then), limit) in self.leds.iter_mut().zip(&next.leds).zip(limits.leds) {
+        let (mask, value) = (self.mask, self.value);
+        for (((bit, led), then), limit) in (0u8..).zip(&mut self.leds).zip(&next.leds).zip(limits) {
             led.then(then, (self.low, self.high), (next.low, next.high), limit)?;
+            let bit = channels::led(bit).unwrap_or(0);
+            let [dark, light] = then.debt;
+            let [after_dark, after_light] = match (mask & bit != 0, value & bit != 0) {
+                (true, true) => [light, light],
+                (true, false) => [dark, dark],
+                _ => [dark, light],
+            };
+            let [was_dark, was_light] = led.debt;
+            led.debt = [was_dark.then(after_dark), was_light.then(after_light)];
         }
         let later = next.first.and_then(|(t, index)| self.silent.map(|s| (plus(s, t), index)));
         self.first = match (self.first, later) {
@@ -161,19 +278,30 @@ impl Block {
         self.last = earlier(next.last, self.last.and_then(|l| next.silent.map(|s| plus(l, s))));
         self.silent = self.silent.and_then(|a| next.silent.map(|b| plus(a, b)));
         self.low = plus(self.low, next.low);
-        self.high = bounded(self.high.checked_add(next.high), end)?;
+        self.high = longest(self.high, next.high, end)?;
         self.value = (self.value & !next.mask) | (next.value & next.mask);
         self.mask |= next.mask;
         Ok(())
     }
 
     /// This block `count` times over; it ends with instruction `end`.
-    pub(super) fn repeat(mut self, count: u32, end: u16, limits: Limits<'_>) -> Result<Self, Violation> {
+    pub(super) fn repeat(mut self, count: u32, end: u16, limits: &Limits) -> Result<Self, Violation> {
         let Some(again) = count.checked_sub(1).filter(|&n| n > 0) else { return Ok(self) };
         // Where one pass meets the next: every seam is like the first.
         self.clone().then(&self, end, limits)?;
-        let high = bounded(self.high.checked_mul(u64::from(count)), end)?;
-        for led in &mut self.leds {
+        let high = match self.high {
+            FOREVER => FOREVER,
+            high => bounded(high.checked_mul(u64::from(count)), end)?,
+        };
+        for (bit, led) in (0u8..).zip(&mut self.leds) {
+            let bit = channels::led(bit).unwrap_or(0);
+            let [dark, light] = led.debt;
+            let more = again.saturating_sub(1);
+            led.debt = match (self.mask & bit != 0, self.value & bit != 0) {
+                (true, true) => [dark.then(light.repeat(more)), light.repeat(again)],
+                (true, false) => [dark.repeat(again), light.then(dark.repeat(more))],
+                _ => [dark.repeat(again), light.repeat(again)],
+            };
             if led.off.is_none()
                 && let Some(lit) = &mut led.lit
             {
@@ -198,7 +326,7 @@ impl Led {
         next: &Self,
         here: (u64, u64),
         there: (u64, u64),
-        limits: &LedLimits,
+        limits: &Limit,
     ) -> Result<(), Violation> {
         let settle = u64::from(limits.settle);
         if let (Some(level), Some((on, index))) = (self.level, next.on) {

@@ -4,7 +4,7 @@
 pub mod naive;
 pub mod random;
 
-use daic_firmware::{AxisLimits, Board, Controller, LedLimits, Sink};
+use daic_firmware::{AxisLimits, Board, Controller, LedLimits, Overdrive, Sink};
 use daic_protocol::frame::{Decoder, Fed, encode_request};
 use daic_protocol::limits::CHUNK_LEN;
 use daic_protocol::message::*;
@@ -113,7 +113,13 @@ impl Rig {
         self.controller.play(tick, &mut self.out);
     }
 
-    /// Plays to the end of the run.
+    /// The inputs change.
+    pub fn input(&mut self, tick: u64, word: u32) {
+        self.now = self.now.max(tick);
+        self.controller.inputs(tick, word, &mut self.out);
+    }
+
+    /// Plays to the end of the run, or until only an input can go on.
     pub fn finish(&mut self) {
         while let Some(due) = self.controller.next_due() {
             self.play_to(due);
@@ -147,18 +153,35 @@ pub fn decode_replies(bytes: &[u8]) -> Vec<(u32, Reply)> {
     got
 }
 
-/// A board whose limits are near enough that random programs meet them.
+/// A board whose limits are near enough that random programs meet them. LED 1 stands less when it is
+/// bright.
 pub fn small_board() -> Board {
-    let axis = AxisLimits { min: -40, max: 40, max_rate: 250_000, max_acceleration: 1_000_000_000 };
-    let led = LedLimits { max_pulse: 60, settle: 20 };
+    let axis = AxisLimits {
+        min: -40,
+        max: 40,
+        max_rate: 250_000,
+        max_acceleration: 1_000_000_000,
+        max_jerk: u32::MAX,
+        home: None,
+    };
+    let plain = LedLimits::new(60, 20);
+    let mut bright = LedLimits { window: 200, ..LedLimits::new(60, 20) };
+    bright.overdrive.push(Overdrive { above: 30_000, max_pulse: 40, cycle: 5 }).unwrap();
     Board {
         name: "small",
-        capabilities: 0,
+        capabilities: Capabilities::TRIGGER_INPUTS | Capabilities::JERK | Capabilities::STREAMING,
         axes: heapless::Vec::from_array([axis; 2]),
-        leds: heapless::Vec::from_array([led; 2]),
+        leds: heapless::Vec::from_array([plain, bright]),
         cameras: 1,
+        inputs: 2,
+        input_latency: 20,
         start_lead: daic_firmware::START_LEAD,
     }
+}
+
+/// The same board without anything that needs a capability.
+pub fn bare_board() -> Board {
+    Board { capabilities: 0, inputs: 0, ..small_board() }
 }
 
 pub fn edge(mask: u32, value: u32, after: u32) -> Instruction {

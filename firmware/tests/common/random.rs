@@ -24,6 +24,11 @@ fn ticks() -> impl Strategy<Value = u32> {
     prop_oneof![4 => 4u32..30, 2 => 0u32..4, 2 => 30u32..80]
 }
 
+/// The other axis, if it comes along.
+fn joined(axis: u8, target: Option<i32>) -> Vec<Instruction> {
+    target.map(|target| Instruction::Join { axis: 1 - axis, target }).into_iter().collect()
+}
+
 fn leaf(moves: bool) -> impl Strategy<Value = Vec<Instruction>> {
     let lines = prop_oneof![Just(1u32), Just(2), Just(0x100), Just(0x1000), Just(0x103), Just(0)];
     let edge = (lines, any::<u32>(), ticks())
@@ -36,19 +41,60 @@ fn leaf(moves: bool) -> impl Strategy<Value = Vec<Instruction>> {
             Instruction::Edge { mask, value: 0, after: length },
         ]
     });
-    let go = (0u8..2, -40i32..=40, 1000u32..=250_000, 1_000_000u32..=1_000_000_000).prop_map(
-        |(axis, target, max_rate, acceleration)| {
-            vec![Instruction::Move { axis, target, max_rate, acceleration, jerk: 0 }]
+    let pace = || {
+        (1000u32..=250_000, 1_000_000u32..=1_000_000_000, prop_oneof![Just(0u32), 1_000_000_000..=u32::MAX])
+    };
+    let join = || prop_oneof![3 => Just(None), 1 => (-40i32..=40).prop_map(Some)];
+    let go = (0u8..2, -40i32..=40, pace(), join()).prop_map(|(axis, target, pace, join)| {
+        let (max_rate, acceleration, jerk) = pace;
+        let mut all = joined(axis, join);
+        all.push(Instruction::Move { axis, target, max_rate, acceleration, jerk });
+        all
+    });
+    let beside = (0u8..2, -40i32..=40, pace(), join(), vec((0u32..3, ticks(), 4u32..62), 1..6)).prop_map(
+        |(axis, target, pace, join, pulses)| {
+            let (max_rate, acceleration, jerk) = pace;
+            let mut all = joined(axis, join);
+            all.push(Instruction::Go { axis, target, max_rate, acceleration, jerk });
+            for (line, before, length) in pulses {
+                let mask = [1, 2, 0x100][line as usize];
+                all.push(Instruction::Edge { mask, value: mask, after: before + 200 });
+                all.push(Instruction::Edge { mask, value: 0, after: length });
+            }
+            all.push(Instruction::Reach);
+            all
         },
     );
+    let capture = (0u8..2, -40i32..=40, pace(), ticks(), 0u32..20, 4u32..62, 0u32..20).prop_map(
+        |(axis, target, pace, settle, lead, pulse, hold)| {
+            let (max_rate, acceleration, jerk) = pace;
+            vec![Instruction::Capture {
+                axis,
+                target,
+                max_rate,
+                acceleration,
+                jerk,
+                settle,
+                cameras: 0x100,
+                leds: 1,
+                lead,
+                pulse,
+                hold,
+            }]
+        },
+    );
+    let level = (0u8..2, prop_oneof![Just(0u16), Just(20_000), Just(40_000)])
+        .prop_map(|(led, level)| vec![Instruction::Level { led, level }]);
     prop_oneof![
         3 => edge,
         6 => pulse,
         2 => ticks().prop_map(|ticks| vec![Instruction::Delay { ticks }]),
         1 => ticks().prop_map(|ticks| vec![Instruction::Settle { ticks }]),
-        2 => (0u8..2, any::<u16>()).prop_map(|(led, level)| vec![Instruction::Level { led, level }]),
+        2 => level,
         1 => any::<u16>().prop_map(|id| vec![Instruction::Mark { id }]),
         if moves { 3 } else { 0 } => go,
+        if moves { 2 } else { 0 } => beside,
+        if moves { 1 } else { 0 } => capture,
     ]
 }
 

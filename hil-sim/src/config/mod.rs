@@ -388,12 +388,44 @@ pub struct BoardConfig {
     pub leds: Vec<LedConfig>,
     /// Camera trigger lines.
     pub cameras: u8,
+    /// Trigger inputs.
+    pub inputs: u8,
+    /// Ticks of 8 ns that the board needs to act on an input.
+    pub input_latency: u32,
+    /// There is an interlock; it is closed while bit 24 of the input word is high.
+    pub interlock: bool,
+    /// The exposure-active line of the camera is wired to the box.
+    pub exposure_active: bool,
+    /// What happens on trigger inputs and interlock, in order of ticks.
+    pub stimulus: Vec<Stimulus>,
+    /// Slots of permanent memory.
+    pub slots: u8,
 }
 
 impl Default for BoardConfig {
     fn default() -> Self {
-        Self { axes: vec![AxisConfig::default(); 3], leds: vec![LedConfig::default(); 2], cameras: 1 }
+        Self {
+            axes: vec![AxisConfig::default(); 3],
+            leds: vec![LedConfig::default(); 2],
+            cameras: 1,
+            inputs: 2,
+            input_latency: 6_250,
+            interlock: false,
+            exposure_active: false,
+            stimulus: Vec::new(),
+            slots: 4,
+        }
     }
+}
+
+/// From a tick on the trigger inputs and the interlock have these levels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Stimulus {
+    /// Ticks of 8 ns since the rig started.
+    pub tick: u64,
+    /// Bits 0 to 7: trigger inputs, bit 24: interlock closed.
+    pub word: u32,
 }
 
 /// Limits of one axis.
@@ -408,12 +440,39 @@ pub struct AxisConfig {
     pub max_rate: u32,
     /// Highest acceleration in steps per second squared.
     pub max_acceleration: u32,
+    /// Highest jerk in steps per second cubed.
+    pub max_jerk: u32,
+    /// The home switch, if there is one.
+    pub home: Option<HomeConfig>,
 }
 
 impl Default for AxisConfig {
     fn default() -> Self {
-        Self { min: -64_000, max: 64_000, max_rate: 128_000, max_acceleration: 1_280_000 }
+        Self {
+            min: -64_000,
+            max: 64_000,
+            max_rate: 128_000,
+            max_acceleration: 1_280_000,
+            max_jerk: 1_000_000_000,
+            home: None,
+        }
     }
+}
+
+/// A home switch and how it is looked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HomeConfig {
+    /// At the high end of the axis.
+    pub high_end: bool,
+    /// Steps per second.
+    pub rate: u32,
+    /// Most steps each way.
+    pub travel: u32,
+    /// The count where the switch lets go.
+    pub position: i32,
+    /// Where the switch really is, in steps from where the stage stands at the start.
+    pub switch_at: i64,
 }
 
 /// Limits of one LED.
@@ -424,12 +483,28 @@ pub struct LedConfig {
     pub max_pulse: u32,
     /// Time a new level needs to settle, in ticks of 8 ns.
     pub settle: u32,
+    /// Most rest that may be owed, in ticks of 8 ns.
+    pub window: u32,
+    /// Stricter limits above some levels, at most 4.
+    pub overdrive: Vec<OverdriveConfig>,
 }
 
 impl Default for LedConfig {
     fn default() -> Self {
-        Self { max_pulse: 1_250_000, settle: 12_500 }
+        Self { max_pulse: 1_250_000, settle: 12_500, window: u32::MAX, overdrive: Vec::new() }
     }
+}
+
+/// What an LED stands above a level.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OverdriveConfig {
+    /// For levels above this one.
+    pub above: u16,
+    /// Longest time on, in ticks of 8 ns.
+    pub max_pulse: u32,
+    /// Ticks of cycle that a tick of light costs.
+    pub cycle: u32,
 }
 
 /// How the box's clock advances.

@@ -121,6 +121,17 @@ impl SimConfig {
             0.0,
             f64::from(daic_protocol::channels::CAMERAS),
         )?;
+        within(
+            "board.inputs",
+            f64::from(self.board.inputs),
+            0.0,
+            f64::from(daic_protocol::channels::INPUTS),
+        )?;
+        within("board.slots", f64::from(self.board.slots), 0.0, daic_protocol::limits::MAX_SLOTS as f64)?;
+        if let Some(pair) = self.board.stimulus.windows(2).find(|p| p[1].tick < p[0].tick) {
+            let (value, min) = (pair[1].tick as f64, pair[0].tick as f64);
+            return Err(ConfigError::OutOfRange { key: "board.stimulus (tick)", value, min, max: f64::MAX });
+        }
         match self.clock {
             ClockMode::Stepped { baud } => within("clock.baud", f64::from(baud), 300.0, 1e9),
             ClockMode::Wall { rate } => within("clock.rate", rate, 1e-6, 1e3),

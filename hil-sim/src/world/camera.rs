@@ -247,6 +247,22 @@ impl Camera {
         (self.open.is_some() || tick < self.busy_until).then_some(self.busy_until)
     }
 
+    /// Whether it is exposed at `tick`.
+    pub fn is_exposing(&self, tick: u64) -> bool {
+        self.open.as_ref().is_some_and(|open| (open.start_tick..open.end_tick).contains(&tick))
+    }
+
+    /// When that changes next after `tick`.
+    pub fn next_change(&self, tick: u64) -> Option<u64> {
+        let open = self.open.as_ref()?;
+        Some(if tick < open.start_tick { open.start_tick } else { open.end_tick.max(tick) })
+    }
+
+    /// Index of its trigger line.
+    pub fn line(&self) -> u8 {
+        u8::try_from(self.line.trailing_zeros()).unwrap_or(0).wrapping_sub(8)
+    }
+
     /// Exposures ended since the last call.
     pub fn take_finished(&mut self) -> Vec<ExposureRecord> {
         std::mem::take(&mut self.finished)

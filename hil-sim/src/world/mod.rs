@@ -6,10 +6,12 @@
 mod camera;
 mod light;
 mod stage;
+mod wiring;
 
 pub use camera::{Camera, ExposureRecord, Light, SubPosition};
 pub use light::Lamps;
 pub use stage::Stage;
+pub use wiring::Wiring;
 
 use daic_protocol::limits::TICK_HZ;
 

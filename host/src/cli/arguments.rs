@@ -3,6 +3,7 @@
 use super::align::AlignArgs;
 use super::calibrate::CalibrateArgs;
 use super::plan::PlanArgs;
+use super::rig::RigArgs;
 use super::strain::{NoiseFloorArgs, ProbeArgs, StrainArgs};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
@@ -66,6 +67,8 @@ pub enum Command {
     Schema,
     /// Say what is here: ports, board, camera, threads, SIMD
     Doctor(DoctorArgs),
+    /// The trigger box by itself: load, play, stream, watch, home, move, store, draw
+    Rig(RigArgs),
 }
 
 /// What the demo simulates.

@@ -10,6 +10,7 @@ mod commands;
 mod microscope;
 mod output;
 mod plan;
+mod rig;
 mod strain;
 mod surface;
 
@@ -71,6 +72,7 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Init(arguments) => commands::init(arguments),
         Command::Schema => commands::schema(),
         Command::Doctor(arguments) => commands::doctor(arguments),
+        Command::Rig(arguments) => rig::run(arguments, output),
     }
 }
 

@@ -52,6 +52,10 @@ impl Output {
         Self { json, bar, stage: Mutex::default(), stop: Arc::default(), lines: !quiet && !terminal }
     }
 
+    pub fn is_json(&self) -> bool {
+        self.json
+    }
+
     /// Errors are drawn with the source line underlined, without colour where nobody can see it.
     pub fn install_error_style(&self) {
         // a second installation in one process is refused and harmless

@@ -1,10 +1,10 @@
 //! Calibration of the microscope by the moves of a dataset.
 
-use super::{Run, failed, read_json, write_json};
+use super::{Run, read_json, write_json};
 use crate::error::Error;
 use crate::microscope::{self, CalibratedModel, KnownMove};
 use crate::process::summary::{CalibratedParameter, CalibrationSummary};
-use daic_dataset::{FrameRecord, FrameRole};
+use daic_dataset::FrameRecord;
 use daic_optics::microscope::Form;
 use daic_rig::experiment::MicroscopeForm;
 use serde::{Deserialize, Serialize};
@@ -27,11 +27,7 @@ impl Run<'_> {
         paired: &[&FrameRecord],
     ) -> Result<(CalibratedModel, CalibrationSummary), Error> {
         let section = self.experiment.microscope.as_ref().ok_or(Error::NoMoves)?;
-        let frames: Vec<(&FrameRecord, [f64; 3])> = paired
-            .iter()
-            .filter(|f| f.role == FrameRole::Calibration)
-            .filter_map(|f| Some((*f, self.moved_um(f)?)))
-            .collect();
+        let frames = self.calibration_frames(paired);
         if frames.is_empty() || !self.experiment.processing.calibrate {
             return Err(Error::NoMoves);
         }
@@ -46,24 +42,15 @@ impl Run<'_> {
             self.resumed += 1;
             return Ok((stored.model, stored.summary));
         }
-        let mut moves = Vec::new();
-        for (record, move_um) in frames {
-            let image = match self.dataset.read_frame(record) {
-                Ok(image) => image,
-                // the other moves may still determine everything; if not, the calibration says so
-                Err(error) => {
-                    self.failed.push(failed(record, &error.into()));
-                    continue;
-                }
-            };
-            let progress = self.progress;
-            let tracks = self.reference()?.track(&image, progress)?;
-            moves.push(KnownMove {
+        let moves: Vec<KnownMove> = self
+            .followed(&frames)?
+            .into_iter()
+            .map(|(record, translation_mm, tracks)| KnownMove {
                 name: record.name.clone(),
-                translation_mm: move_um.map(|um| um * 1e-3),
+                translation_mm,
                 tracks,
-            });
-        }
+            })
+            .collect();
         self.progress.stage("calibrating", 0);
         let settings = microscope::MoveSettings {
             form: match section.form {

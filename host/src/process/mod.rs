@@ -263,6 +263,9 @@ struct StoredCalibration {
     covariance: Option<Covariance>,
 }
 
+/// A frame, the specimen's move from the reference in millimetres, and the reference's points in it.
+type Followed<'f> = (&'f FrameRecord, [f64; 3], measure::Tracks);
+
 impl Run<'_> {
     /// Matches the reference once. The search range comes from the experiment's own optics, so that
     /// the match does not depend on the calibration that follows.
@@ -299,13 +302,34 @@ impl Run<'_> {
         Some([0, 1, 2].map(|i| to[i] - from[i]))
     }
 
+    /// The calibration frames whose position relative to the reference is known, with it in micrometres.
+    fn calibration_frames<'f>(&self, paired: &[&'f FrameRecord]) -> Vec<(&'f FrameRecord, [f64; 3])> {
+        let of_role = paired.iter().filter(|f| f.role == FrameRole::Calibration);
+        of_role.filter_map(|f| Some((*f, self.moved_um(f)?))).collect()
+    }
+
+    /// The reference's points in each of the frames that can be read, with its move in millimetres; the others may
+    /// still determine everything, and if not, the calibration says so.
+    fn followed<'f>(&mut self, frames: &[(&'f FrameRecord, [f64; 3])]) -> Result<Vec<Followed<'f>>, Error> {
+        let mut moved = Vec::new();
+        for (record, move_um) in frames {
+            let image = match self.dataset.read_frame(record) {
+                Ok(image) => image,
+                Err(error) => {
+                    self.failed.push(failed(record, &error.into()));
+                    continue;
+                }
+            };
+            let progress = self.progress;
+            let tracks = self.reference()?.track(&image, progress)?;
+            moved.push((*record, move_um.map(|um| um * 1e-3), tracks));
+        }
+        Ok(moved)
+    }
+
     fn calibrated(&mut self, paired: &[&FrameRecord], start: &Optics) -> Result<Calibrated, Error> {
         let as_stated = Calibrated { optics: *start, covariance: None, summary: None };
-        let frames: Vec<(&FrameRecord, [f64; 3])> = paired
-            .iter()
-            .filter(|f| f.role == FrameRole::Calibration)
-            .filter_map(|f| Some((*f, self.moved_um(f)?)))
-            .collect();
+        let frames = self.calibration_frames(paired);
         if frames.is_empty() || !self.experiment.processing.calibrate {
             return Ok(as_stated);
         }
@@ -321,20 +345,11 @@ impl Run<'_> {
             let StoredCalibration { optics, covariance, summary, .. } = stored;
             return Ok(Calibrated { optics, covariance, summary: Some(summary) });
         }
-        let mut moved = Vec::new();
-        for (record, move_um) in frames {
-            let image = match self.dataset.read_frame(record) {
-                Ok(image) => image,
-                // the other moves may still determine everything; if not, the calibration says so
-                Err(error) => {
-                    self.failed.push(failed(record, &error.into()));
-                    continue;
-                }
-            };
-            let progress = self.progress;
-            let tracks = self.reference()?.track(&image, progress)?;
-            moved.push(calibration::Moved { displacement_mm: move_um.map(|um| um * 1e-3), tracks });
-        }
+        let moved = self.followed(&frames)?;
+        let moved: Vec<calibration::Moved> = moved
+            .into_iter()
+            .map(|(_, displacement_mm, tracks)| calibration::Moved { displacement_mm, tracks })
+            .collect();
         self.progress.stage("calibrating", 0);
         let axis_height_mm = self.experiment.processing.axis_height.mm();
         let shared = self.settings.points_per_measurement();

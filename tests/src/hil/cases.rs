@@ -1,7 +1,10 @@
 //! The cases.
 
-use super::{Case, Host, Outcome};
-use crate::expansion::expand;
+mod inputs;
+mod slots;
+mod streaming;
+
+use super::{Case, Host, Outcome, expected};
 use daic_firmware::pico::INTERLOCK;
 use daic_protocol::channels::{SAFE_WORD, camera, led};
 use daic_protocol::message::*;
@@ -20,7 +23,17 @@ pub const ALL: &[Case] = &[
     Case { name: "shortest steps", run: shortest },
     Case { name: "sustained rate", run: sustained },
     Case { name: "moves and strobes", run: moves },
+    Case { name: "jerk-limited moves, two axes, strobes beside them", run: jerk },
     Case { name: "10 000 edges", run: many_edges },
+    Case { name: "10 000 edges streamed, all events read", run: streaming::edges },
+    Case { name: "a stream that ends too soon", run: streaming::dry },
+    Case { name: "trigger to edge", run: inputs::trigger },
+    Case { name: "time-outs of triggers", run: inputs::timeouts },
+    Case { name: "exposure-active", run: inputs::exposure },
+    Case { name: "a limit switch", run: inputs::limit },
+    Case { name: "a silent host", run: inputs::silence },
+    Case { name: "slots and autostart", run: slots::autostart },
+    Case { name: "power cut while a slot is written", run: slots::cut },
     Case { name: "one tick wrong is found", run: one_tick },
     Case { name: "the player misses a clock", run: slipped },
     Case { name: "stop ends with an instruction", run: stop },
@@ -87,7 +100,7 @@ fn check(holds: bool, message: impl FnOnce() -> String) -> Result<(), String> {
 fn same_by_events(program: &[Instruction], events: &[Event], start: u64) -> Result<(), String> {
     let axes = daic_protocol::channels::AXIS_MASK;
     let mut before = 0;
-    let mut wanted = expand(program);
+    let mut wanted = expected(program);
     wanted.retain(|&(_, word)| (std::mem::replace(&mut before, word) ^ word) & !axes != 0);
     let told: Vec<(u64, u32)> = events
         .iter()
@@ -113,7 +126,7 @@ fn prefix(
     edges: &[(u64, u32)],
     origin: i64,
 ) -> Result<(usize, Option<i64>), String> {
-    let wanted = expand(program);
+    let wanted = expected(program);
     let got: Vec<(i64, u32)> = edges.iter().map(|&(t, w)| (t as i64 - origin, w)).collect();
     let same = got.iter().zip(&wanted).take_while(|(g, w)| g.0 == w.0 as i64 && g.1 == w.1).count();
     match &got[same..] {
@@ -129,7 +142,7 @@ fn prefix(
 /// Ticks of the recorder between the program's beginning and the first edge of the recording that is
 /// sure to be there.
 fn origin(host: &mut Host, program: &[Instruction]) -> Result<i64, String> {
-    let wanted = expand(program)[0].0 as i64;
+    let wanted = expected(program)[0].0 as i64;
     let first = host.recorded().first().copied().ok_or("no edge at all")?;
     Ok(first.0 as i64 - wanted)
 }
@@ -225,12 +238,45 @@ fn moves(host: &mut Host, long: bool) -> Result<Outcome, String> {
     Ok(outcome)
 }
 
-/// Edges at 15 … 60 kHz in nested loops: about 8000 instructions' worth from a dozen.
+/// Two axes in step along an S-curve, blocking and beside strobes, and `Capture`.
+fn jerk(host: &mut Host, long: bool) -> Result<Outcome, String> {
+    let steps = if long { 3000 } else { 150 };
+    let (max_rate, acceleration, jerk) = (20_000, 1_000_000, 500_000_000);
+    let join = |target| Instruction::Join { axis: 1, target };
+    let mut program = vec![
+        join(-steps / 3),
+        Instruction::Move { axis: 0, target: steps, max_rate, acceleration, jerk },
+        join(7),
+        Instruction::Go { axis: 0, target: 0, max_rate, acceleration, jerk },
+    ];
+    for n in 0..40 {
+        program.extend([set(lamp(n % 4), 97 * US + u32::from(n)), clear(lamp(n % 4), 4 + 3 * u32::from(n))]);
+    }
+    program.extend([
+        Instruction::Reach,
+        Instruction::Capture {
+            axis: 1,
+            target: 0,
+            max_rate,
+            acceleration,
+            jerk,
+            settle: 20 * US,
+            cameras: shutter(),
+            leds: lamp(2),
+            lead: 11,
+            pulse: 50 * US,
+            hold: 13,
+        },
+    ]);
+    exact(host, &program)
+}
+
+/// Edges at 15 … 30 kHz in nested loops: about 8000 instructions' worth from a dozen.
 fn many_edges(host: &mut Host, _: bool) -> Result<Outcome, String> {
     let aux = 1 << 13;
     let inner = repeat(
         24,
-        &[set(aux, 17 * US + 1), clear(aux, 23 * US), set(shutter(), 31 * US), clear(shutter(), 19 * US + 2)],
+        &[set(aux, 34 * US + 1), clear(aux, 46 * US), set(shutter(), 62 * US), clear(shutter(), 38 * US + 2)],
     );
     let mut body = inner;
     body.extend([set(lamp(0), 29 * US), clear(lamp(0), 7 * US), set(lamp(3), 4), clear(lamp(3), 40 * US)]);
@@ -454,11 +500,15 @@ fn interlock(host: &mut Host, long: bool) -> Result<Outcome, String> {
     if let Some(bench) = host.target.bench() {
         bench.input(INTERLOCK, false);
     }
-    let from = host.status()?.next_event;
-    host.start(&program)?;
-    let ran = host.finish(from, 25_000, 5_000_000)?;
-    check(ran.fault.map(|f| f.cause) == Some(FaultCause::Interlock), || format!("{:?}", ran.events.last()))?;
-    check(ran.edges.is_empty(), || format!("{} edges with the interlock open", ran.edges.len()))?;
+    host.target.pass(100_000);
+    let hash = host.load(&program)?;
+    host.done(&Request::Arm { hash })?;
+    let before = host.recorded().len();
+    let refused = host.request(&Request::Start)?;
+    check(refused == Reply::Refused(Refusal::InterlockOpen), || format!("{refused:?}"))?;
+    host.target.pass(3_000_000);
+    let edges = host.recorded().len() - before;
+    check(edges == 0, || format!("{edges} edges with the interlock open"))?;
     Ok(Outcome::Passed(vec![("instants", instants as f64, ""), ("open to safe", worst as f64, "ticks")]))
 }
 

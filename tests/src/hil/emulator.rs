@@ -7,8 +7,8 @@ use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
-/// Longest time that an answer may take, in ticks (80 ms).
-const PATIENCE: u64 = 10_000_000;
+/// Longest time that an answer may take, in ticks: 0.64 s, for storing into flash.
+const PATIENCE: u64 = 80_000_000;
 
 /// From reset until requests are answered, in ticks (5 ms).
 const BOOT: u64 = 625_000;
@@ -119,8 +119,10 @@ impl Target for Emulator {
     fn exchange(&mut self, frame: &[u8]) -> Vec<u8> {
         let hex: String = frame.iter().map(|byte| format!("{byte:02x}")).collect();
         let link = self.link_name();
-        self.received[usize::from(self.usb)].clear();
-        self.command(&json!({ "op": "send", "link": link, "hex": hex }));
+        if !frame.is_empty() {
+            self.received[usize::from(self.usb)].clear();
+            self.command(&json!({ "op": "send", "link": link, "hex": hex }));
+        }
         self.run(PATIENCE, Some(link));
         std::mem::take(&mut self.received[usize::from(self.usb)])
     }
@@ -178,6 +180,8 @@ impl Bench for Emulator {
     fn power_cycle(&mut self) {
         self.dead = false;
         self.command(&json!({ "op": "power" }));
+        self.levels = 0;
+        self.words.clear();
         self.run(BOOT, None);
         self.received = Default::default();
     }
@@ -207,6 +211,10 @@ impl Bench for Emulator {
             self.usb = usb;
             self.restart();
         }
+    }
+
+    fn wire(&mut self, from: u8, to: u8) {
+        self.command(&json!({ "op": "wire", "from": from, "to": to }));
     }
 
     fn duty(&mut self) -> [f64; 4] {

@@ -1,7 +1,7 @@
 //! The host's side of every case.
 
-use super::Target;
-use crate::expansion::{changes_only, expand};
+use super::{Target, expected};
+use crate::expansion::changes_only;
 use daic_protocol::frame::{Decoder, Fed, encode_request};
 use daic_protocol::limits::CHUNK_LEN;
 use daic_protocol::message::*;
@@ -163,6 +163,41 @@ impl Host {
         Ok(())
     }
 
+    /// Replies to several requests that are sent at once.
+    ///
+    /// # Errors
+    /// Fewer replies than requests.
+    pub fn requests(&mut self, requests: &[Request]) -> Result<Vec<Reply>, String> {
+        let mut ids = Vec::new();
+        let mut bytes = Vec::new();
+        for request in requests {
+            let (id, frame) = self.frame(request);
+            ids.push(id);
+            bytes.extend(frame);
+        }
+        let mut replies = Vec::new();
+        for _ in 0..2 * requests.len() {
+            for byte in self.target.exchange(&bytes) {
+                if let Fed::Message { id, message, .. } = self.decoder.feed_reply(byte)
+                    && ids.contains(&id)
+                {
+                    replies.push(message);
+                }
+            }
+            if replies.len() == requests.len() {
+                return Ok(replies);
+            }
+            bytes.clear();
+        }
+        Err(format!("{} replies to {requests:?}", replies.len()))
+    }
+
+    /// Forgets what was recorded.
+    pub fn forget(&mut self) {
+        self.recorded();
+        self.edges.clear();
+    }
+
     /// Everything recorded so far in this run.
     pub fn recorded(&mut self) -> &[(u64, u32)] {
         if let Some(edges) = self.target.edges() {
@@ -212,7 +247,7 @@ impl Host {
     /// # Errors
     /// As of the parts.
     pub fn play(&mut self, program: &[Instruction]) -> Result<Ran, String> {
-        let length = expand(program).last().map_or(0, |e| e.0);
+        let length = expected(program).last().map_or(0, |e| e.0);
         let from = self.status()?.next_event;
         self.start(program)?;
         self.finish(from, 125_000, 2 * length + 10_000_000)
@@ -224,7 +259,7 @@ impl Host {
     /// # Errors
     /// The first edge that differs, and by how much.
     pub fn compare(&self, program: &[Instruction], ran: &Ran) -> Result<i64, String> {
-        let expected = expand(program);
+        let expected = expected(program);
         let origin = match (self.target.edges_on_board_clock(), ran.edges.first(), expected.first()) {
             (true, ..) => ran.start as i64,
             (false, Some(got), Some(wanted)) => got.0 as i64 - wanted.0 as i64,

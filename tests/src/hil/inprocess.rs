@@ -2,6 +2,7 @@
 
 use super::{Bench, Target};
 use daic_firmware::{Board, Controller, Sink};
+use daic_protocol::channels::INTERLOCK;
 
 /// Ticks of a byte at 1 Mbaud.
 const BYTE_TICKS: u64 = 1250;
@@ -26,7 +27,10 @@ impl Sink for Words {
 
 impl Default for InProcess {
     fn default() -> Self {
-        Self { controller: Controller::new(Board::pico(), 1), boots: 1, now: 0, out: Words::default() }
+        let controller = Controller::new(Board::pico(), 1);
+        let mut target = Self { controller, boots: 0, now: 0, out: Words::default() };
+        target.restart();
+        target
     }
 }
 
@@ -64,5 +68,6 @@ impl Target for InProcess {
         self.boots += 1;
         self.controller = Controller::new(Board::pico(), self.boots);
         (self.now, self.out) = (0, Words::default());
+        self.controller.inputs(0, INTERLOCK, &mut self.out);
     }
 }

@@ -7,9 +7,16 @@ pub mod cases;
 pub mod emulator;
 pub mod host;
 pub mod inprocess;
+#[path = "../../../firmware/tests/common/naive.rs"]
+#[allow(dead_code, missing_docs)]
+mod naive;
 pub mod serial;
 
 pub use host::Host;
+
+use crate::expansion::{changes_only, expand};
+use daic_firmware::Board;
+use daic_protocol::program::Instruction;
 
 /// What a target is made of and how it is reached.
 pub trait Target {
@@ -53,6 +60,8 @@ pub trait Bench {
     fn slip(&mut self, at: u64);
     /// Which link is used from now on.
     fn link(&mut self, usb: bool);
+    /// Connects an output to an input.
+    fn wire(&mut self, from: u8, to: u8);
     /// Duty cycle of each level output.
     fn duty(&mut self) -> [f64; 4];
 }
@@ -98,4 +107,18 @@ pub fn run(target: Box<dyn Target>, long: bool, filter: &str) -> Vec<(&'static s
         outcomes.push((case.name, outcome));
     }
     outcomes
+}
+
+/// What a program comes to, without the code of firmware or host: changes of the output word as (tick after the
+/// begin of the run, word).
+pub fn expected(program: &[Instruction]) -> Vec<(u64, u32)> {
+    use Instruction::{Capture, Go, Join, Move, Reach};
+    let harder = |i: &Instruction| {
+        matches!(i, Capture { .. } | Go { .. } | Join { .. } | Reach)
+            || matches!(i, Move { jerk, .. } if *jerk > 0)
+    };
+    if program.iter().any(harder) {
+        return changes_only(&naive::play(program, &Board::pico(), 0, [0; 6], 0, 0).words);
+    }
+    expand(program)
 }

@@ -1,6 +1,7 @@
 //! A board at a serial port: the simulated one behind a PTY, or a real one.
 
 use super::{Bench, Target};
+use daic_firmware::pico::LEDS;
 use daic_hil_sim::config::ClockMode;
 use daic_hil_sim::{SimConfig, SimRig, Transport};
 use std::io::{ErrorKind, Read, Write};
@@ -22,7 +23,9 @@ fn open(path: &str) -> Result<Box<dyn serialport::SerialPort>, String> {
 }
 
 fn simulate() -> Result<(SimRig, Box<dyn serialport::SerialPort>), String> {
-    let config = SimConfig { clock: ClockMode::Stepped { baud: 1_000_000 }, ..SimConfig::default() };
+    let mut config = SimConfig { clock: ClockMode::Stepped { baud: 1_000_000 }, ..SimConfig::default() };
+    // As many LEDs as the Pico has.
+    config.board.leds.resize(usize::from(LEDS), Default::default());
     let rig = SimRig::start(config, Transport::Pty { link: None }).map_err(|error| error.to_string())?;
     rig.set_rendering(false);
     let port = open(rig.port())?;

@@ -7,20 +7,29 @@
 #![no_main]
 
 mod clock;
+mod flash;
+mod inputs;
 mod player;
 mod reg;
 mod reset;
 mod serial;
 mod stack;
 
+use core::mem::MaybeUninit;
 use daic_firmware::links::FrameGate;
-use daic_firmware::pico::INTERLOCK;
+use daic_firmware::pico::{INTERLOCK, SLOTS};
+use daic_firmware::slots::{self, Slots};
 use daic_firmware::{Board, Controller, Sink};
-use daic_protocol::message::{Health, State};
+use daic_protocol::channels;
+use daic_protocol::limits::MAX_SLOTS;
+use daic_protocol::message::{Autostart, FaultCause, Health, ResetCause, SlotError, SlotInfo, State};
+use daic_protocol::program::ProgramBytes;
 use embedded_hal::pwm::SetDutyCycle;
+use flash::Chip;
 use hal::Clock;
 use hal::fugit::{MicrosDurationU32, RateExtU32};
 use hal::pac::{self, interrupt};
+use inputs::{Change, Inputs};
 use player::Player;
 use rp2040_hal as hal;
 use serial::{Link, Outgoing};
@@ -37,6 +46,33 @@ const WATCHDOG: MicrosDurationU32 = MicrosDurationU32::millis(500);
 /// What the controller reaches directly: levels at their time; words are the player's.
 struct Direct<'a> {
     levels: [&'a mut dyn SetDutyCycle<Error = core::convert::Infallible>; 4],
+    /// Tick at which the run under way ends safe by itself.
+    ended: Option<u64>,
+    slots: Slots<Chip>,
+    /// What the slots hold.
+    list: heapless::Vec<SlotInfo, MAX_SLOTS>,
+}
+
+impl Direct<'_> {
+    /// The first slot whose program starts like this.
+    fn listed(&self, like: impl Fn(Autostart) -> bool) -> Option<u8> {
+        self.list.iter().find(|held| like(held.autostart)).map(|held| held.slot)
+    }
+}
+
+/// Starts the program that belongs to a trigger input that rose, if nothing else is played.
+fn autostart(risen: u32, controller: &mut Controller, direct: &mut Direct<'_>, now: u64) {
+    if risen == 0 || !matches!(controller.state(), State::Empty | State::Loaded) {
+        return;
+    }
+    let slot = direct.listed(|start| match start {
+        Autostart::Input { input } => channels::trigger_input(input).is_some_and(|bit| risen & bit != 0),
+        _ => false,
+    });
+    if let Some(slot) = slot {
+        // Refused: as if there were none.
+        let _ = controller.autostart(now, slot, direct);
+    }
 }
 
 impl Sink for Direct<'_> {
@@ -47,8 +83,33 @@ impl Sink for Direct<'_> {
         }
     }
     fn halt(&mut self, tick: u64) -> u64 {
-        player::halt().max(tick)
+        if self.ended.is_some_and(|ended| ended <= tick) { tick } else { player::halt().max(tick) }
     }
+    fn store(&mut self, slot: u8, program: &[u8], autostart: Autostart) -> Result<(), SlotError> {
+        let stored = self.slots.store(slot, program, slots::tag(autostart));
+        self.list = self.slots.list();
+        stored.map(|_| ())
+    }
+    fn fetch(&mut self, slot: u8, program: &mut ProgramBytes) -> Result<(), SlotError> {
+        self.slots.load(slot, program).map(|_| ())
+    }
+    fn erase(&mut self, slot: u8) -> Result<(), SlotError> {
+        let erased = self.slots.stored(slot).and_then(|_| self.slots.erase(slot));
+        self.list = self.slots.list();
+        erased
+    }
+    fn slots(&mut self) -> heapless::Vec<SlotInfo, MAX_SLOTS> {
+        self.list.clone()
+    }
+}
+
+/// The controller, made where it stays: it is too large to be passed about.
+#[inline(never)]
+fn controller(boot_id: u32) -> &'static mut Controller {
+    static mut PLACE: MaybeUninit<Controller> = MaybeUninit::uninit();
+    // SAFETY: called once, by `main`, which never ends.
+    let place = unsafe { &mut *(&raw mut PLACE) };
+    place.write(Controller::new(Board::pico(), boot_id))
 }
 
 #[hal::entry]
@@ -81,6 +142,7 @@ fn main() -> ! {
     } {}
     let mut player = Player::new();
     clock::start(&mut core.SYST);
+    let mut inputs = Inputs::new();
 
     let slices = hal::pwm::Slices::new(p.PWM, &mut p.RESETS);
     let (mut pwm0, mut pwm1) = (slices.pwm0, slices.pwm1);
@@ -93,8 +155,12 @@ fn main() -> ! {
     pwm1.channel_b.output_to(pins.gpio19);
     pwm0.enable();
     pwm1.enable();
+    let slots = Slots::new(Chip, SLOTS);
     let mut direct = Direct {
         levels: [&mut pwm0.channel_a, &mut pwm0.channel_b, &mut pwm1.channel_a, &mut pwm1.channel_b],
+        ended: None,
+        list: slots.list(),
+        slots,
     };
     for channel in &mut direct.levels {
         let _ = channel.set_duty_cycle(0);
@@ -131,10 +197,7 @@ fn main() -> ! {
         (0..32).fold(0u32, |bits, _| (bits << 1) | u32::from(p.ROSC.randombit().read().randombit().bit()));
     // Another one at every boot: noise of the ring oscillator, and the count since power came.
     let boot_id = noise.wrapping_add(boots.wrapping_mul(0x9e37_79b9));
-    let Some(controller) = cortex_m::singleton!(: Controller = Controller::new(Board::pico(), boot_id))
-    else {
-        unreachable!()
-    };
+    let controller = controller(boot_id);
     let mut links = [
         (Link::Uart, FrameGate::new(), Outgoing::new(Link::Uart)),
         (Link::Usb, FrameGate::new(), Outgoing::new(Link::Usb)),
@@ -142,13 +205,38 @@ fn main() -> ! {
     let mut watch = stack::Watch::new();
     let mut health = Health { reset: cause, stack_size: stack::Watch::size(), ..Health::default() };
     let mut last = clock::now();
+    let (changes, _) = inputs.poll();
+    let mut before = 0;
+    for Change { tick, word } in changes {
+        controller.inputs(tick, word, &mut direct);
+        before = word;
+    }
+    if cause == ResetCause::Power
+        && let Some(slot) = direct.listed(|start| start == Autostart::PowerUp)
+    {
+        // Refused: as if there were none.
+        let _ = controller.autostart(clock::now(), slot, &mut direct);
+    }
     loop {
         let now = clock::now();
         health.turn = health.turn.max(u32::try_from(now.wrapping_sub(last)).unwrap_or(u32::MAX));
         last = now;
         watchdog.feed();
         player.feed(now);
-        controller.play(now, &mut direct);
+        direct.ended = player.ended();
+        let (changes, known) = inputs.poll();
+        for Change { tick, word } in changes {
+            if before & !word & channels::INTERLOCK != 0 {
+                // The player went safe by itself.
+                let opened = player::opened_at().unwrap_or(tick);
+                controller.trip(FaultCause::Interlock, opened, &mut direct);
+            }
+            controller.inputs(tick, word, &mut direct);
+            player.inputs(tick, word, controller);
+            autostart(word & !before, controller, &mut direct, now);
+            before = word;
+        }
+        controller.play_ahead(now, known, &mut direct);
         player.service(controller, &mut direct);
         watch.look();
         let restarted = serial::restarted();
@@ -159,7 +247,7 @@ fn main() -> ! {
             // One frame a turn, so that none delays the player by more than itself.
             while let Some((byte, stamp)) = serial::receive(*link) {
                 let Some(frame) = gate.feed(byte) else { continue };
-                health.received_lost = serial::lost();
+                health.received_lost = serial::lost().wrapping_add(Inputs::lost());
                 health.stack_peak = watch.peak;
                 health.lead = player.lead;
                 health.replies_lost = outgoing.lost;

@@ -9,7 +9,7 @@ use crate::reg::{self, ADDR, CLKDIV, DMA, EXECCTRL, INSTR, PINCTRL, PIO0, SHIFTC
 use core::cell::UnsafeCell;
 use core::sync::atomic::{AtomicU32, Ordering, fence};
 use daic_firmware::blocks::{BLOCK, Block, MAX_HOLD, Packer};
-use daic_firmware::pico::{INTERLOCK, LINES, ONBOARD, OUT_BASE, OUT_PINS, pin_word};
+use daic_firmware::pico::{INPUTS, INTERLOCK, LINES, ONBOARD, OUT_BASE, OUT_PINS, pin_word};
 use daic_firmware::{Ahead, Controller, Reached, Sink};
 use daic_protocol::channels::SAFE_WORD;
 use daic_protocol::message::{FaultCause, State};
@@ -57,6 +57,8 @@ const BUFFERS: usize = 128;
 const SLOTS: usize = 256;
 /// How far ahead words are expanded: 20 ms.
 pub const LOOK_AHEAD: u64 = 2_500_000;
+/// So much is missing before more is expanded, in one go: 0.5 ms.
+const REFILL: u64 = 62_500;
 /// Longest time spent on looking ahead in one turn of the main loop: 0.5 ms.
 const FILL: u64 = 62_500;
 /// From the launch to the first tick of a program: 200 µs of the safe word.
@@ -67,6 +69,8 @@ const LAUNCH_MARGIN: u64 = 12_500;
 const LAST_FILL: u64 = 50_000;
 /// From the reading of the core's timer for which the launch is set to the first word on the pins.
 const LAUNCH_DELAY: u64 = 14;
+/// A stream that has come so little before its time counts as dry: 2 ms.
+const DRY_LEAD: u64 = 250_000;
 /// Turns of three ticks that the processor may be silent: 5 ms.
 const BUDGET: u32 = 208_000;
 /// Longest time from the last report of the processor to the safe word.
@@ -142,6 +146,8 @@ struct Run {
     packer: Packer,
     /// All of it is committed.
     complete: bool,
+    /// Tick at which it ends safe by itself.
+    ended: Option<u64>,
     number: u32,
 }
 
@@ -159,10 +165,18 @@ struct Packing<'a> {
     packer: &'a mut Packer,
     ring: &'a mut Ring,
     broken: bool,
+    /// Words taken, and how many may be.
+    words: u32,
+    most: u32,
+    deadline: u64,
 }
 
 impl Sink for Packing<'_> {
+    fn is_full(&self) -> bool {
+        self.broken || self.words >= self.most || (self.words % 8 == 7 && clock::now() > self.deadline)
+    }
     fn word(&mut self, tick: u64, word: u32) {
+        self.words = self.words.wrapping_add(1);
         let ring = &mut *self.ring;
         self.broken |= self.packer.word(tick, pin_word(word), &mut |block| ring.commit(block)).is_err();
     }
@@ -206,7 +220,9 @@ impl Player {
         }
         connect(ONBOARD);
         // Input enabled, Schmitt trigger, pull-down: an open wire does not permit.
-        write(reg::PADS_BANK0 + 4 + 4 * u32::from(INTERLOCK), 0x46);
+        for (_, gpio) in INPUTS {
+            write(reg::PADS_BANK0 + 4 + 4 * u32::from(gpio), 0x46);
+        }
         player
     }
 
@@ -270,6 +286,22 @@ impl Player {
         }
     }
 
+    /// Tick at which the run under way ends safe by itself, once that is known.
+    pub fn ended(&self) -> Option<u64> {
+        self.run.as_ref().and_then(|run| run.ended)
+    }
+
+    /// The input word is `word` from tick `tick` on; the controller has been told.
+    pub fn inputs(&mut self, tick: u64, word: u32, controller: &Controller) {
+        let Some(run) = self.run.as_mut().filter(|run| !run.complete) else { return };
+        let ring = &mut self.ring;
+        let most = ring.free().saturating_sub(3);
+        let (packer, deadline) = (&mut run.packer, u64::MAX);
+        let mut packing = Packing { packer, ring, broken: false, words: 0, most, deadline };
+        run.ahead.inputs(tick, word, controller, &mut packing);
+        run.complete |= packing.broken;
+    }
+
     /// Begins, feeds and ends runs as the controller says.
     pub fn service(&mut self, controller: &mut Controller, sink: &mut dyn Sink) {
         if controller.state() != State::Running {
@@ -291,9 +323,9 @@ impl Player {
         self.clear();
         self.lead = u32::MAX;
         let Some(ahead) = controller.ahead() else { return };
-        let launch = ahead.due().saturating_sub(LEAD_IN);
+        let launch = ahead.due(controller).saturating_sub(LEAD_IN);
         let packer = Packer::new(launch.saturating_add(LAUNCH_DELAY));
-        self.run = Some(Run { ahead, packer, complete: false, number: controller.run() });
+        self.run = Some(Run { ahead, packer, complete: false, ended: None, number: controller.run() });
         if !Self::permitted() {
             controller.trip(FaultCause::Interlock, clock::now(), sink);
             return;
@@ -320,31 +352,55 @@ impl Player {
             self.lead = self.lead.min(u32::try_from(lead).unwrap_or(u32::MAX));
         }
         let until = now.saturating_add(LOOK_AHEAD);
-        // A step never fills more than three blocks.
-        while !run.complete && ring.free() >= 4 && run.packer.upto() < until {
-            if clock::now() > deadline {
+        if run.packer.upto().saturating_add(REFILL) > until {
+            return;
+        }
+        while !run.complete && run.packer.upto() < until {
+            // A word never fills more than one block, nor does what comes before it once it is near.
+            let most = ring.free().saturating_sub(3);
+            if most == 0 || clock::now() > deadline {
                 break;
             }
-            let due = run.ahead.due();
+            let due = run.ahead.due(controller);
             let quiet = run.packer.upto().saturating_add(8 * u64::from(MAX_HOLD));
             if due > quiet {
                 run.packer.quiet(quiet, &mut |block| ring.commit(block));
                 continue;
             }
-            let mut packing = Packing { packer: &mut run.packer, ring: &mut *ring, broken: false };
-            let reached = run.ahead.play(due, controller, &mut packing);
-            let broken = packing.broken;
+            let packer = &mut run.packer;
+            let mut packing = Packing { packer, ring: &mut *ring, broken: false, words: 0, most, deadline };
+            // The words of so long a time, one after the other, fill no more than a block each.
+            let soon = due.saturating_add(8 * u64::from(MAX_HOLD)).min(until.max(due));
+            let reached = run.ahead.play(soon, controller.now(), controller, &mut packing);
+            let (broken, some) = (packing.broken, packing.words > 0);
             match reached {
-                Reached::Waiting(_) if !broken => {}
+                Reached::Waiting(next) if !broken && (some || next > due) => {}
+                // Only an input can go on, or time without one.
+                Reached::Waiting(next) if !broken => {
+                    run.packer.flush(next, &mut |block| ring.commit(block));
+                    break;
+                }
+                Reached::Dry(tick) if !broken => {
+                    run.packer.quiet(tick, &mut |block| ring.commit(block));
+                    let late = clock::now().saturating_add(DRY_LEAD);
+                    if ring.end >= late || !ring.running {
+                        break;
+                    }
+                    if !run.packer.flush(tick, &mut |block| ring.commit(block)) {
+                        // Played to the end of what there is.
+                        controller.seal_stream();
+                    }
+                }
                 Reached::Ended(tick) if !broken => {
                     run.packer.finish(tick, &mut |block| ring.commit(block));
                     run.complete = true;
+                    run.ended = Some(tick);
                 }
-                // The player runs dry where the words end, and says so.
+                // The controller finds it too and halts; else the player runs dry.
                 _ => run.complete = true,
             }
         }
-        controller.committed(run.ahead.due());
+        controller.committed(run.ahead.due(controller));
     }
 
     /// Whether the player has gone safe by itself, why and when.
@@ -354,10 +410,7 @@ impl Player {
         }
         let at = |m| read(machine(PIO0, m, ADDR));
         if at(GUARD) == GUARD_SAFE {
-            let [low, high] = &OPENED;
-            let (low, high) = (low.load(Ordering::Relaxed), high.load(Ordering::Relaxed));
-            let opened = u64::from(high) << 32 | u64::from(low);
-            return Some((FaultCause::Interlock, if opened == 0 { clock::now() } else { opened }));
+            return Some((FaultCause::Interlock, opened_at().unwrap_or_else(clock::now)));
         }
         if at(PULSE) == PULSE_SAFE {
             let tick = self.fed.saturating_add(SILENCE).min(self.ring.last);
@@ -394,6 +447,13 @@ pub fn kill() {
     write(reg::PADS_BANK0 + 4 + 4 * u32::from(ONBOARD), 0xd6);
 }
 
+/// Tick at which the interlock opened since the run began.
+pub fn opened_at() -> Option<u64> {
+    let [low, high] = &OPENED;
+    let (low, high) = (low.load(Ordering::Relaxed), high.load(Ordering::Relaxed));
+    Some(u64::from(high) << 32 | u64::from(low)).filter(|opened| *opened > 0)
+}
+
 /// The interlock has opened.
 pub fn opened() {
     let now = clock::now();
@@ -412,17 +472,26 @@ fn launch_at(tick: u64) -> bool {
         if !(200..2 * LAUNCH_MARGIN).contains(&left) {
             return false;
         }
-        launch(clock::reading_at(tick));
+        launch(clock::reading_at(tick), PIO0, (1 << PLAY) | (1 << PULSE) | (1 << GUARD));
         true
     })
 }
 
-/// Waits until the core's timer, which counts down, reads `reading`, and starts the machines.
+/// Starts machines of a block soon; returns the tick at which they begin.
+pub fn start_at_leisure(block: u32, machines: u32) -> u64 {
+    critical_section::with(|_| {
+        let tick = clock::now().wrapping_add(1000);
+        launch(clock::reading_at(tick), block, machines);
+        tick.wrapping_add(LAUNCH_DELAY)
+    })
+}
+
+/// Waits until the core's timer, which counts down, reads `reading`, and starts `machines` of a PIO block.
 ///
 /// In RAM, so that no flash access comes in between: always the same number of cycles.
 #[inline(never)]
 #[unsafe(link_section = ".data.launch")]
-fn launch(reading: u32) {
+fn launch(reading: u32, block: u32, machines: u32) {
     // SAFETY: reads one register and writes another; jumps within its own instructions.
     unsafe {
         core::arch::asm!(
@@ -443,14 +512,14 @@ fn launch(reading: u32) {
             "nop",
             ".endr",
             ".balign 4",
-            "3: movs {left}, #{machines}",
+            "3: movs {left}, {machines}",
             "str {left}, [{ctrl}]",
             left = out(reg) _,
             to = out(reg) _,
             cvr = in(reg) reg::SYST_CVR,
             reading = in(reg) reading,
-            ctrl = in(reg) PIO0,
-            machines = const (1 << PLAY) | (1 << PULSE) | (1 << GUARD),
+            ctrl = in(reg) block,
+            machines = in(reg) machines,
             options(nostack),
         );
     }

@@ -1,7 +1,11 @@
 //! Registers by address: those that the HAL does not offer.
 
+/// Levels of all GPIOs.
+pub const GPIO_IN: u32 = 0xd000_0004;
 /// PIO block 0, whose machines drive and guard the outputs.
 pub const PIO0: u32 = 0x5020_0000;
+/// PIO block 1, whose machines stamp inputs.
+pub const PIO1: u32 = 0x5030_0000;
 /// DMA controller.
 pub const DMA: u32 = 0x5000_0000;
 /// Functions of the pins.

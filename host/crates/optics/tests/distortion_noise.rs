@@ -59,7 +59,7 @@ fn turns(pixel: [f64; 2]) -> [f64; 2] {
 
 #[test]
 fn stated_noise_is_the_scatter() {
-    const REPEATS: usize = 100;
+    const REPEATS: usize = 40;
     const SEED: u64 = 41;
     let mut random = Normal::new(SEED);
     let windows = [window(8.0), window(9.0)];
@@ -119,9 +119,10 @@ fn stated_noise_is_the_scatter() {
             terms.clone().min(),
             terms.max()
         );
-        // One node's variance from 100 repeats is known to 14 %; some 40 of the measured nodes and 15 of the
-        // border vary by themselves. Three standard deviations of the root.
-        assert!(ratio[0].iter().all(|r| (r - 1.0).abs() < 0.035), "{ratio:?}");
-        assert!(ratio[1].iter().all(|r| (r - 1.0).abs() < 0.06), "{ratio:?}");
+        // One node's variance from 40 repeats is known to 23 %; some 40 of the measured nodes and 15 of the
+        // border vary by themselves: three standard deviations of the root. (100 repeats gave 0.989 to 1.007 and
+        // 0.974 to 1.008.)
+        assert!(ratio[0].iter().all(|r| (r - 1.0).abs() < 0.055), "{ratio:?}");
+        assert!(ratio[1].iter().all(|r| (r - 1.0).abs() < 0.09), "{ratio:?}");
     }
 }

@@ -120,12 +120,18 @@ impl RigError {
     }
 }
 
-fn cause_text(cause: FaultCause) -> &'static str {
-    match cause {
+fn cause_text(cause: FaultCause) -> String {
+    let text = match cause {
         FaultCause::Aborted => "a host asked it to abort",
         FaultCause::Underrun => "its player ran dry",
         FaultCause::Internal => "the program broke a rule while running",
-        FaultCause::Interlock => "its interlock input opened",
+        FaultCause::HostLost => "it heard nothing from the host for longer than the program allows",
+        FaultCause::Interlock => "its interlock opened",
+        FaultCause::LimitSwitch { axis } => return format!("axis {axis} met its limit switch"),
+        FaultCause::TriggerTimeout { input } => return format!("no trigger came on input {input} in time"),
+        FaultCause::HomingFailed { axis } => return format!("axis {axis} did not find its home switch"),
         FaultCause::Heartbeat => "its processor did not report in time",
-    }
+        FaultCause::LedLimit { led } => return format!("LED {led} was about to exceed a limit"),
+    };
+    text.to_owned()
 }

@@ -318,7 +318,11 @@ fn a_run_can_be_cancelled_and_is_stopped_when_it_takes_too_long() {
 
     // An instruction that would take too long is aborted.
     let mut bench = Bench::playing(SLOW, LONG);
-    let error = bench.disturbed(|_, cancel| cancel.store(true, SeqCst));
+    let error = bench.disturbed(|_, cancel| {
+        // the frame before it takes 40 ms: cancelled within that, the run would end without it
+        std::thread::sleep(Duration::from_millis(300));
+        cancel.store(true, SeqCst);
+    });
     assert!(matches!(error, RigError::Cancelled), "{error:?}");
     assert_eq!(bench.link.status().expect("status").state, State::Faulted);
 

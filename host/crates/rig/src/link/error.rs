@@ -1,6 +1,7 @@
 //! What can go wrong between host and box.
 
-use daic_protocol::message::{Refusal, State};
+use daic_protocol::limits::TICK_HZ;
+use daic_protocol::message::{Refusal, SlotError, State};
 use std::fmt;
 use std::io;
 use thiserror::Error;
@@ -267,7 +268,36 @@ impl fmt::Display for Refused<'_> {
                 v.instruction, v.rule, v.value, v.limit
             ),
             Refusal::IdReused => f.write_str("the request id was used before for another request"),
+            Refusal::NotStreaming => f.write_str("no stream has begun, or the box cannot stream"),
+            Refusal::StreamGap { expected, given } => {
+                write!(f, "byte {expected} of the stream was expected, byte {given} came")
+            }
+            Refusal::StreamFull { limit, end } => {
+                write!(f, "the stream may go to byte {limit} so far, not to {end}")
+            }
+            Refusal::StreamEnded { length } => {
+                write!(f, "the stream holds {length} bytes of instructions, and is complete or empty")
+            }
+            Refusal::InterlockOpen => f.write_str("the interlock is open; close it first"),
+            Refusal::NotHomed { axis } => {
+                write!(f, "axis {axis} does not know where it is; home it first (`daic rig home`)")
+            }
+            Refusal::Cooling { led, ticks } => {
+                let ms = *ticks as f64 * 1e3 / f64::from(TICK_HZ);
+                write!(f, "LED {led} must cool for {ms:.1} ms after what it has done; wait and start again")
+            }
+            Refusal::Slot { slot, error } => write!(f, "slot {slot}: {}", slot_error(*error)),
         }
+    }
+}
+
+fn slot_error(error: SlotError) -> &'static str {
+    match error {
+        SlotError::NoMemory => "the box has no permanent memory",
+        SlotError::NoSuchSlot => "there is no such slot",
+        SlotError::Empty => "nothing is stored there",
+        SlotError::Damaged => "what is stored there is damaged; store the program again",
+        SlotError::WriteFailed => "it could not be written; try again, then another slot",
     }
 }
 

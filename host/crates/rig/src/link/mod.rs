@@ -7,17 +7,22 @@
 
 mod error;
 mod events;
+mod stream;
 mod transport;
 
 pub(crate) use error::state_name;
 pub use error::{LinkError, Outcome};
 pub use events::EventReader;
+pub use stream::StreamSender;
 pub use transport::{MAX_WRITE, PipeEnd, StreamTransport, Transport, available_ports, open, pipe};
 
 use crate::clock::ClockSample;
 use daic_protocol::frame::{self, Decoder, Fed};
 use daic_protocol::limits::{CHUNK_LEN, PROTOCOL_VERSION};
-use daic_protocol::message::{Events, Hello, Rejected, Reply, Request, SCHEMA_HASH, State, Status};
+use daic_protocol::message::{
+    Autostart, Events, Hello, Inputs, Rejected, Reply, Request, SCHEMA_HASH, SelfTest, SlotInfo, State,
+    Status, StreamState,
+};
 use std::io;
 use std::time::{Duration, Instant};
 
@@ -262,6 +267,65 @@ impl Link {
         self.done(&Request::ClearFault)
     }
 
+    /// The input word and what was counted on it.
+    ///
+    /// # Errors
+    /// As [`Link::request`].
+    pub fn inputs(&mut self) -> Result<Inputs, LinkError> {
+        match self.request(&Request::Inputs)? {
+            Reply::Inputs(inputs) => Ok(inputs),
+            other => Err(unexpected(&Request::Inputs, &other)),
+        }
+    }
+    /// Keeps the committed program in a slot of the box.
+    ///
+    /// # Errors
+    /// As [`Link::request`].
+    pub fn store(&mut self, slot: u8, autostart: Autostart) -> Result<State, LinkError> {
+        self.done(&Request::SlotStore { slot, autostart })
+    }
+    /// Commits the program of a slot.
+    ///
+    /// # Errors
+    /// As [`Link::request`].
+    pub fn load_slot(&mut self, slot: u8) -> Result<State, LinkError> {
+        self.done(&Request::SlotLoad { slot })
+    }
+    /// Forgets the program of a slot.
+    ///
+    /// # Errors
+    /// As [`Link::request`].
+    pub fn erase(&mut self, slot: u8) -> Result<State, LinkError> {
+        self.done(&Request::SlotErase { slot })
+    }
+    /// What the slots hold, empty ones left out.
+    ///
+    /// # Errors
+    /// As [`Link::request`].
+    pub fn slots(&mut self) -> Result<Vec<SlotInfo>, LinkError> {
+        match self.request(&Request::Slots)? {
+            Reply::Slots(slots) => Ok(slots.into_iter().collect()),
+            other => Err(unexpected(&Request::Slots, &other)),
+        }
+    }
+    /// Lets the box test itself.
+    ///
+    /// # Errors
+    /// As [`Link::request`].
+    pub fn self_test(&mut self) -> Result<SelfTest, LinkError> {
+        match self.request(&Request::SelfTest)? {
+            Reply::SelfTest(found) => Ok(found),
+            other => Err(unexpected(&Request::SelfTest, &other)),
+        }
+    }
+
+    pub(crate) fn stream(&mut self, request: &Request) -> Result<StreamState, LinkError> {
+        match self.request(request)? {
+            Reply::Stream(state) => Ok(state),
+            other => Err(unexpected(request, &other)),
+        }
+    }
+
     /// One reply's worth of events from `from` on; see [`EventReader`] for a stream without gaps.
     ///
     /// # Errors
@@ -406,8 +470,12 @@ fn unexpected(request: &Request, reply: &Reply) -> LinkError {
         Reply::Done { .. } => "Done",
         Reply::Refused(_) => "Refused",
         Reply::Events(_) => "Events",
-        Reply::Health(_) => "Health",
         Reply::Clock { .. } => "Clock",
+        Reply::Stream(_) => "Stream",
+        Reply::Inputs(_) => "Inputs",
+        Reply::Slots(_) => "Slots",
+        Reply::SelfTest(_) => "SelfTest",
+        Reply::Health(_) => "Health",
     };
     LinkError::Unexpected { request: name(request), reply }
 }
@@ -427,6 +495,16 @@ fn name(request: &Request) -> &'static str {
         Request::ClearFault => "ClearFault",
         Request::ReadEvents { .. } => "ReadEvents",
         Request::Clock => "Clock",
+        Request::StreamBegin => "StreamBegin",
+        Request::StreamWrite { .. } => "StreamWrite",
+        Request::StreamEnd { .. } => "StreamEnd",
+        Request::StreamStatus => "StreamStatus",
+        Request::Inputs => "Inputs",
+        Request::SlotStore { .. } => "SlotStore",
+        Request::SlotLoad { .. } => "SlotLoad",
+        Request::SlotErase { .. } => "SlotErase",
+        Request::Slots => "Slots",
+        Request::SelfTest => "SelfTest",
         Request::Health => "Health",
     }
 }

@@ -1,38 +1,8 @@
-//! When each step of a move is made.
-//!
-//! A move of `N` steps with rate `v` (steps/s) and acceleration `a` (steps/s²) follows the symmetric
-//! trapezoid x(t) of continuous motion; step `k` (1 … N) is made when x = k. In ticks after the
-//! origin of the move, with f = [`TICK_HZ`], ⌊·⌋ the floor, and A(j) = ⌊√(2 j f² / a)⌋:
-//!
-//! * trapezoid, if v² < a N, with total time T = ⌊f (N a + v²) / (a v)⌋:
-//!   * 2 a k ≤ v²: tick A(k);
-//!   * else, 2 a (N − k) ≤ v²: tick T − A(N − k);
-//!   * else tick ⌊f (2 a k + v²) / (2 a v)⌋;
-//! * triangle, if v² ≥ a N, with T = ⌊√(4 N f² / a)⌋:
-//!   * 2 k ≤ N: tick A(k);
-//!   * else tick T − A(N − k).
-//!
-//! All of it is integer arithmetic. [`Profile::tick_of`] is the definition as it stands;
-//! [`Steps`] yields the same ticks one after the other at the cost of about two 64-bit divisions
-//! per step (none in the cruise), which a core without a divider can afford.
+//! Trapezoids: constant acceleration, constant rate, constant deceleration.
 
-use daic_protocol::limits::{MIN_STEP_TICKS, TICK_HZ};
+use super::{DIR_DELAY, DIR_SETUP, MAX_ACCELERATION, MAX_STEP_RATE, STEP_PULSE};
+use daic_protocol::limits::TICK_HZ;
 use fixed::types::U32F32;
-
-/// Ticks that a step line stays high (2 µs); it also stays low at least about as long.
-pub const STEP_PULSE: u64 = 250;
-/// Ticks from the direction word of a move to the origin of its step times (5 µs).
-pub const DIR_SETUP: u64 = 625;
-/// Ticks from the end of the previous instruction to the direction word of a move.
-pub const DIR_DELAY: u64 = MIN_STEP_TICKS as u64;
-/// Highest step rate any axis may have, in steps per second: twice [`STEP_PULSE`] per step.
-pub const MAX_STEP_RATE: u32 = TICK_HZ / (2 * STEP_PULSE as u32);
-/// Highest acceleration any axis may have, in steps per second squared.
-///
-/// With it and [`MAX_STEP_RATE`] every intermediate value of [`Steps`] fits 64 bits:
-/// an accelerating axis has a·t ≤ v f ≤ 250 000 · 125 000 000 < 2⁴⁵, so the remainders stay below
-/// 2 f² + 2 v f + a < 2⁵⁵, and the divisor of the cruise 2 a v ≤ 2⁴⁹.
-pub const MAX_ACCELERATION: u32 = 1_000_000_000;
 
 const F: u64 = TICK_HZ as u64;
 /// 2 f²: what one step adds to the radicand times `a`.
@@ -40,7 +10,7 @@ const STEP_SQUARE: u64 = 2 * F * F;
 
 /// The planned motion of one move.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Profile {
+pub struct Trapezoid {
     steps: u32,
     rate: u32,
     acceleration: u32,
@@ -52,7 +22,7 @@ pub struct Profile {
     falling: u32,
 }
 
-impl Profile {
+impl Trapezoid {
     /// Plans a move of `steps` steps. Rate and acceleration are taken into 1 … [`MAX_STEP_RATE`] and
     /// 1 … [`MAX_ACCELERATION`]; the verifier refuses programs that ask for more.
     pub fn new(steps: u32, rate: u32, acceleration: u32) -> Self {
@@ -208,8 +178,8 @@ impl Root {
 
 /// The ticks of all steps of a move after its origin, in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Steps {
-    profile: Profile,
+pub struct TrapezoidSteps {
+    profile: Trapezoid,
     /// Steps yielded.
     done: u32,
     root: Root,
@@ -218,9 +188,9 @@ pub struct Steps {
     rest: u64,
 }
 
-impl Steps {
+impl TrapezoidSteps {
     /// Begins with the first step.
-    pub fn new(profile: Profile) -> Self {
+    pub fn new(profile: Trapezoid) -> Self {
         Self { profile, done: 0, root: Root::at(profile.acceleration, 0), tick: 0, rest: 0 }
     }
 
@@ -250,7 +220,7 @@ impl Steps {
     }
 }
 
-impl Iterator for Steps {
+impl Iterator for TrapezoidSteps {
     type Item = u64;
 
     fn next(&mut self) -> Option<u64> {

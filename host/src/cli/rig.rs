@@ -1,0 +1,416 @@
+//! `daic rig`: the trigger box by itself.
+
+use super::commands::as_json;
+use super::output::{Answer, Output};
+use clap::{Args, Subcommand};
+use daic::box_program::{encode, read, read_instructions};
+use daic::recording::event_record;
+use daic::{Error, Progress as _, expand, timeline};
+use daic_dataset::atomic;
+use daic_protocol::limits::TICK_HZ;
+use daic_protocol::message::{Autostart, Event, EventKind, SelfTests, State};
+use daic_protocol::program::Instruction;
+use daic_rig::RigError;
+use daic_rig::link::{EventReader, Link, LinkOptions, StreamSender};
+use serde_json::{Value, json};
+use std::fmt::Write as _;
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+/// Between two looks at the box.
+const POLL: Duration = Duration::from_millis(10);
+
+#[derive(Debug, Args)]
+pub struct RigArgs {
+    /// Serial port or tcp://HOST:PORT of the trigger box
+    #[arg(long, global = true, default_value = "/dev/ttyACM0")]
+    pub port: String,
+    /// Bits per second of a serial port
+    #[arg(long, global = true, default_value_t = 115_200)]
+    pub baud: u32,
+    #[command(subcommand)]
+    pub command: RigCommand,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum RigCommand {
+    /// What the box is, its state, its inputs, its slots
+    Info,
+    /// Load a program (experiment .toml, instructions .json, or encoded)
+    Load { program: PathBuf },
+    /// Play the program that is loaded, or load and play one, and wait for its end
+    Run { program: Option<PathBuf> },
+    /// Play a program of any length while it is sent
+    Stream { program: PathBuf },
+    /// Print events as they come, until interrupted
+    Watch,
+    /// Print the events that the box still keeps
+    Events {
+        /// First event wanted
+        #[arg(long, default_value_t = 0)]
+        from: u32,
+    },
+    /// Find the home switches of axes
+    Home {
+        /// Axis numbers
+        #[arg(required = true)]
+        axes: Vec<u8>,
+    },
+    /// Move one axis
+    Move {
+        axis: u8,
+        /// Absolute target in steps
+        #[arg(allow_hyphen_values = true)]
+        target: i32,
+        /// Steps per second
+        #[arg(long, default_value_t = 8000)]
+        rate: u32,
+        /// Steps per second squared
+        #[arg(long, default_value_t = 80_000)]
+        acceleration: u32,
+        /// Steps per second cubed; 0 does not limit it
+        #[arg(long, default_value_t = 0)]
+        jerk: u32,
+    },
+    /// Keep the loaded program, or FILE, in a slot of the box
+    Store {
+        slot: u8,
+        program: Option<PathBuf>,
+        /// Start it at power-up
+        #[arg(long, conflicts_with = "on_input")]
+        on_power_up: bool,
+        /// Start it at a rising edge of this trigger input
+        #[arg(long, value_name = "INPUT")]
+        on_input: Option<u8>,
+        /// Forget what the slot holds
+        #[arg(long, conflicts_with_all = ["program", "on_power_up", "on_input"])]
+        erase: bool,
+    },
+    /// Let the box test itself
+    Selftest,
+    /// Draw a program as a timing diagram (.svg, .html or .vcd), alone or against what was played
+    Timeline {
+        program: PathBuf,
+        /// File to write
+        #[arg(long, value_name = "FILE")]
+        out: PathBuf,
+        /// Play it first and draw what was played, and the difference
+        #[arg(long)]
+        play: bool,
+    },
+}
+
+fn rig<T>(result: Result<T, daic_rig::link::LinkError>) -> Result<T, Error> {
+    Ok(result.map_err(RigError::from)?)
+}
+
+pub fn run(arguments: &RigArgs, output: &Output) -> Result<Answer, Error> {
+    if let RigCommand::Timeline { program, out, play: false } = &arguments.command
+        && program.extension().is_none_or(|e| e != "toml")
+    {
+        let planned = expand::expand(&read_instructions(program)?, [0; 6])?;
+        return draw(out, &planned, None);
+    }
+    let options = LinkOptions { baud: arguments.baud, ..LinkOptions::default() };
+    let mut link = rig(Link::open(&arguments.port, options))?;
+    match &arguments.command {
+        RigCommand::Info => info(&mut link),
+        RigCommand::Load { program } => {
+            let hash = load(&mut link, program)?;
+            Ok(Answer::new(json!({ "program": hash }), format!("loaded, hash {hash:#010x}")))
+        }
+        RigCommand::Run { program } => {
+            if let Some(program) = program {
+                load(&mut link, program)?;
+            }
+            let events = play_loaded(&mut link, output)?;
+            played_answer(&events)
+        }
+        RigCommand::Stream { program } => stream(&mut link, program, output),
+        RigCommand::Watch => watch(&mut link, output),
+        RigCommand::Events { from } => {
+            let mut events = Vec::new();
+            rig(EventReader::new(*from).poll(&mut link, &mut events))?;
+            Ok(Answer::new(json!({ "events": records(&events)? }), lines(&events)))
+        }
+        RigCommand::Home { axes } => {
+            let program: Vec<_> = axes.iter().map(|&axis| Instruction::Home { axis }).collect();
+            play(&mut link, &program, output)
+        }
+        RigCommand::Move { axis, target, rate, acceleration, jerk } => {
+            let (axis, target) = (*axis, *target);
+            let go =
+                Instruction::Move { axis, target, max_rate: *rate, acceleration: *acceleration, jerk: *jerk };
+            play(&mut link, &[go], output)
+        }
+        RigCommand::Store { slot, program, on_power_up, on_input, erase } => {
+            if *erase {
+                rig(link.erase(*slot))?;
+                return Ok(Answer::new(
+                    json!({ "slot": slot, "erased": true }),
+                    format!("slot {slot} is empty"),
+                ));
+            }
+            if let Some(program) = program {
+                load(&mut link, program)?;
+            }
+            let autostart = match (on_power_up, on_input) {
+                (true, _) => Autostart::PowerUp,
+                (false, Some(input)) => Autostart::Input { input: *input },
+                (false, None) => Autostart::Off,
+            };
+            rig(link.store(*slot, autostart))?;
+            let slots = as_json(&rig(link.slots())?)?;
+            Ok(Answer::new(json!({ "slots": slots }), format!("stored in slot {slot}")))
+        }
+        RigCommand::Selftest => self_test(&mut link),
+        RigCommand::Timeline { program, out, play } => {
+            let instructions = read(program, &mut link)?;
+            let position = rig(link.status())?.position;
+            let planned = expand::expand(&instructions, position)?;
+            if !play {
+                return draw(out, &planned, None);
+            }
+            rig(link.load(&encode(&instructions)?))?;
+            let events = play_loaded(&mut link, output)?;
+            let begin =
+                events.iter().find(|e| matches!(e.kind, EventKind::RunStarted { .. })).map_or(0, |e| e.tick);
+            let played = timeline::played(&events, begin);
+            draw(out, &timeline::without_axes(&planned), Some(&played))
+        }
+    }
+}
+
+fn load(link: &mut Link, path: &std::path::Path) -> Result<u32, Error> {
+    let instructions = read(path, link)?;
+    rig(link.load(&encode(&instructions)?))
+}
+
+fn play(link: &mut Link, program: &[Instruction], output: &Output) -> Result<Answer, Error> {
+    rig(link.load(&encode(program)?))?;
+    let events = play_loaded(link, output)?;
+    played_answer(&events)
+}
+
+fn info(link: &mut Link) -> Result<Answer, Error> {
+    let status = rig(link.status())?;
+    let inputs = rig(link.inputs())?;
+    let slots = rig(link.slots())?;
+    let hello = link.hello().clone();
+    let mut text = format!(
+        "{} firmware {} (protocol {}), boot {:#010x}\nstate {:?}, program {}, run {}\n",
+        hello.board,
+        hello.firmware,
+        hello.protocol,
+        hello.boot_id,
+        status.state,
+        status.program.map_or("none".to_owned(), |hash| format!("{hash:#010x}")),
+        status.run
+    );
+    if let Some(fault) = status.fault {
+        writeln!(text, "fault: {:?} at tick {}, instruction {}", fault.cause, fault.tick, fault.instruction)
+            .ok();
+    }
+    for (axis, position) in status.position.iter().enumerate().take(usize::from(hello.axes)) {
+        let homed = if inputs.homed >> axis & 1 == 1 { "" } else { " (not homed)" };
+        writeln!(text, "axis {axis}: {position} steps{homed}").ok();
+    }
+    for input in 0..usize::from(hello.inputs) {
+        let level = inputs.word >> input & 1;
+        writeln!(
+            text,
+            "input {input}: {level}, {} rising edges, {} missed",
+            inputs.rising[input], inputs.missed[input]
+        )
+        .ok();
+    }
+    for slot in &slots {
+        writeln!(
+            text,
+            "slot {}: {} bytes, hash {:#010x}, {:?}",
+            slot.slot, slot.length, slot.hash, slot.autostart
+        )
+        .ok();
+    }
+    let json = json!({
+        "hello": as_json(&hello)?,
+        "status": as_json(&status)?,
+        "inputs": as_json(&inputs)?,
+        "slots": as_json(&slots)?,
+    });
+    Ok(Answer::new(json, text))
+}
+
+/// Arms, starts, reads events to the end of the run.
+fn play_loaded(link: &mut Link, output: &Output) -> Result<Vec<Event>, Error> {
+    let status = rig(link.status())?;
+    let Some(hash) = status.program else { return Err(RigError::NotReady { state: status.state }.into()) };
+    if status.state == State::Faulted {
+        rig(link.clear_fault())?;
+    }
+    rig(link.arm(hash))?;
+    output.stop_on_interrupt();
+    output.stage("playing", 0);
+    rig(link.start())?;
+    follow(link, status.next_event, output, &mut |_| Ok(()))
+}
+
+/// Reads events until the run ends; `each` is called between two looks.
+fn follow(
+    link: &mut Link,
+    from: u32,
+    output: &Output,
+    each: &mut dyn FnMut(&mut Link) -> Result<(), Error>,
+) -> Result<Vec<Event>, Error> {
+    let mut reader = EventReader::new(from);
+    let mut events = Vec::new();
+    let mut stopped = false;
+    loop {
+        let before = events.len();
+        rig(reader.poll(link, &mut events))?;
+        for event in events.get(before..).unwrap_or(&[]) {
+            match event.kind {
+                EventKind::RunDone { .. } => return Ok(events),
+                EventKind::Faulted { cause, instruction } => {
+                    return Err(RigError::BoxFaulted { cause, tick: event.tick, instruction }.into());
+                }
+                _ => {}
+            }
+        }
+        if output.stop_requested().load(Ordering::Relaxed) && !stopped {
+            rig(link.stop())?;
+            stopped = true;
+        }
+        each(link)?;
+        std::thread::sleep(POLL);
+    }
+}
+
+fn stream(link: &mut Link, path: &std::path::Path, output: &Output) -> Result<Answer, Error> {
+    let instructions = read(path, link)?;
+    let count = instructions.len();
+    let status = rig(link.status())?;
+    if status.state == State::Faulted {
+        rig(link.clear_fault())?;
+    }
+    output.stop_on_interrupt();
+    output.stage("streaming", count as u64);
+    let mut sender = rig(StreamSender::begin(link, instructions.into_iter()))?;
+    rig(link.start())?;
+    let mut last = sender.state();
+    let events = follow(link, status.next_event, output, &mut |link| {
+        if !last.ended {
+            rig(sender.fill(link))?;
+            last = sender.state();
+            output.advance(u64::from(last.instruction));
+        }
+        Ok(())
+    })?;
+    let lead = events.iter().find_map(|e| match e.kind {
+        EventKind::StreamLead { ticks } if ticks != u64::MAX => Some(ticks as f64 * 1e3 / f64::from(TICK_HZ)),
+        _ => None,
+    });
+    let text = lead
+        .map_or("played; it fitted the memory".to_owned(), |ms| format!("played; smallest lead {ms:.3} ms"));
+    Ok(Answer::new(json!({ "instructions": count, "min_lead_ms": lead, "events": events.len() }), text))
+}
+
+fn watch(link: &mut Link, output: &Output) -> Result<Answer, Error> {
+    output.stop_on_interrupt();
+    let mut reader = EventReader::new(rig(link.status())?.next_event);
+    let mut count = 0;
+    let begin = Instant::now();
+    while !output.stop_requested().load(Ordering::Relaxed) {
+        let mut events = Vec::new();
+        rig(reader.poll(link, &mut events))?;
+        // With --json the answer is the only object on stdout.
+        for event in events.iter().filter(|_| !output.is_json()) {
+            super::output::print_line(&line(event));
+        }
+        count += events.len();
+        std::thread::sleep(POLL);
+    }
+    let seconds = begin.elapsed().as_secs_f64();
+    Ok(Answer::new(
+        json!({ "events": count, "seconds": seconds }),
+        format!("{count} events in {seconds:.1} s"),
+    ))
+}
+
+fn self_test(link: &mut Link) -> Result<Answer, Error> {
+    let found = rig(link.self_test())?;
+    let names = [
+        (SelfTests::CRC, "CRC"),
+        (SelfTests::PROGRAM, "program in memory"),
+        (SelfTests::MOTION, "step times"),
+        (SelfTests::VERIFIER, "verifier"),
+        (SelfTests::FRAMING, "framing"),
+        (SelfTests::OUTPUTS, "outputs safe"),
+    ];
+    let mut text = String::new();
+    for (bit, name) in names.into_iter().filter(|(bit, _)| found.made & bit != 0) {
+        let verdict = if found.failed & bit == 0 { "ok" } else { "FAILED" };
+        writeln!(text, "{name}: {verdict}").ok();
+    }
+    for bit in (16..32).filter(|bit| found.made >> bit & 1 == 1) {
+        let verdict = if found.failed >> bit & 1 == 0 { "ok" } else { "FAILED" };
+        writeln!(text, "board test {}: {verdict}", bit - 16).ok();
+    }
+    Ok(Answer::new(as_json(&found)?, text).checked(found.failed == 0))
+}
+
+fn draw(
+    out: &std::path::Path,
+    planned: &timeline::Words,
+    played: Option<&timeline::Words>,
+) -> Result<Answer, Error> {
+    let found = played.map(|played| timeline::difference(planned, played));
+    let mut traces = vec![("planned", "#06c", planned)];
+    let mut scopes = vec![("planned", planned)];
+    if let Some(played) = played {
+        traces.push(("played", "#c30", played));
+        scopes.push(("played", played));
+    }
+    let spans = found.as_ref().map_or(&[][..], |d| &d.spans);
+    let text = match out.extension().and_then(|e| e.to_str()) {
+        Some("svg") => timeline::svg(&traces, spans),
+        Some("html") => timeline::html("Timeline", &traces, found.as_ref()),
+        Some("vcd") => timeline::vcd(&scopes),
+        _ => return Err(Error::UnknownFormat { path: out.to_owned(), allowed: ".svg, .html, .vcd" }),
+    };
+    atomic::write_bytes(out, text.as_bytes())?;
+    let same = found.as_ref().is_none_or(timeline::Difference::is_none);
+    let verdict = match &found {
+        None => String::new(),
+        Some(d) if d.is_none() => ", played as planned to the tick".to_owned(),
+        Some(d) => format!(", DIFFERENT from change {} on", d.first.map_or(0, |f| f.0)),
+    };
+    let json = json!({
+        "file": out.display().to_string(),
+        "planned": planned.len(),
+        "difference": found.as_ref().map(as_json).transpose()?,
+    });
+    Ok(Answer::new(json, format!("{}: {} changes{verdict}", out.display(), planned.len())).checked(same))
+}
+
+fn played_answer(events: &[Event]) -> Result<Answer, Error> {
+    let words = events.iter().find_map(|e| match e.kind {
+        EventKind::RunDone { words, .. } => Some(words),
+        _ => None,
+    });
+    let text = format!("played: {} words, {} events", words.unwrap_or(0), events.len());
+    Ok(Answer::new(json!({ "words": words, "events": records(events)? }), text))
+}
+
+fn records(events: &[Event]) -> Result<Value, Error> {
+    as_json(&events.iter().map(event_record).collect::<Vec<_>>())
+}
+
+fn line(event: &Event) -> String {
+    format!("{:>8} {:>16} {:?}", event.seq, event.tick, event.kind)
+}
+
+fn lines(events: &[Event]) -> String {
+    events.iter().map(line).collect::<Vec<_>>().join("\n")
+}
