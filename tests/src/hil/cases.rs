@@ -49,6 +49,7 @@ pub const ALL: &[Case] = &[
     Case { name: "levels", run: levels },
     Case { name: "starts are alike", run: starts },
     Case { name: "health", run: health },
+    Case { name: "the longest verification", run: verification },
 ];
 
 fn set(mask: u32, after: u32) -> Instruction {
@@ -690,6 +691,7 @@ fn health(host: &mut Host, _: bool) -> Result<Outcome, String> {
     if health.stack_size == 0 {
         return Ok(Outcome::Cannot("the board does not measure itself"));
     }
+    check(health.reset == ResetCause::Power, || format!("{health:?}"))?;
     check(health.stack_peak > 0 && health.stack_peak < health.stack_size / 2, || format!("{health:?}"))?;
     check(health.received_lost == 0 && health.replies_lost == 0, || format!("{health:?}"))?;
     check(health.lead > 0, || format!("{health:?}"))?;
@@ -697,6 +699,37 @@ fn health(host: &mut Host, _: bool) -> Result<Outcome, String> {
         ("stack peak", f64::from(health.stack_peak), "bytes"),
         ("stack size", f64::from(health.stack_size), "bytes"),
         ("least lead", f64::from(health.lead), "ticks"),
+        ("longest turn", f64::from(health.turn), "ticks"),
+    ]))
+}
+
+/// A program whose end, where it breaks a rule, the verifier does not reach: six times 20 000 instructions.
+fn verification(host: &mut Host, _: bool) -> Result<Outcome, String> {
+    use daic_protocol::program::{Condition, Timeout};
+    let wait = |timeout| Instruction::Wait {
+        input: 0,
+        condition: Condition::Rising,
+        skip: 0,
+        delay: daic_firmware::pico::INPUT_LATENCY,
+        timeout,
+        on_timeout: Timeout::Continue,
+    };
+    let aux = 1 << 13;
+    let mut program = repeat(1_000_000, &[wait(2000 * US), set(aux, 50), clear(aux, 60)]);
+    program.extend([set(lamp(0), 100), wait(0), clear(lamp(0), 100)]);
+    let refused = host.load(&program).err().unwrap_or_default();
+    check(refused.contains("CannotProve"), || format!("answered {refused:?}"))?;
+    // The stack is looked through a little in every turn.
+    host.target.pass(16_000_000);
+    let health = host.health()?;
+    if health.stack_size == 0 {
+        return Ok(Outcome::Cannot("the board does not measure itself"));
+    }
+    // The watchdog has not acted.
+    check(health.reset == ResetCause::Power, || format!("{health:?}"))?;
+    check(health.stack_peak < health.stack_size / 2, || format!("{health:?}"))?;
+    Ok(Outcome::Passed(vec![
+        ("stack peak", f64::from(health.stack_peak), "bytes"),
         ("longest turn", f64::from(health.turn), "ticks"),
     ]))
 }

@@ -12,7 +12,7 @@ const BASE: u32 = FLASH - size(SLOTS);
 /// Where the flash is read.
 const WINDOW: u32 = 0x1000_0000;
 /// The watchdog's time, as [`crate::WATCHDOG`]: it counts two a microsecond.
-const WATCHDOG_LOAD: u32 = 1_000_000;
+const WATCHDOG_LOAD: u32 = 8_000_000;
 
 const _: () = assert!(size(SLOTS) == 160 * 1024);
 

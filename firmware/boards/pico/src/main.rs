@@ -40,8 +40,9 @@ use usb_device::bus::UsbBusAllocator;
 #[used]
 static BOOT2_FIRMWARE: [u8; 256] = rp2040_boot2::BOOT_LOADER_W25Q080;
 
-/// A turn of the main loop that takes longer than this resets the board.
-const WATCHDOG: MicrosDurationU32 = MicrosDurationU32::millis(500);
+/// A turn of the main loop that takes longer than this resets the board. The longest is a verification; while
+/// a program is played the player itself does not wait so long.
+const WATCHDOG: MicrosDurationU32 = MicrosDurationU32::secs(4);
 
 /// What the controller reaches directly: levels at their time; words are the player's.
 struct Direct<'a> {

@@ -59,8 +59,8 @@ const SLOTS: usize = 256;
 pub const LOOK_AHEAD: u64 = 2_500_000;
 /// So much is missing before more is expanded, in one go: 0.5 ms.
 const REFILL: u64 = 62_500;
-/// Longest time spent on looking ahead in one turn of the main loop: 0.5 ms.
-const FILL: u64 = 62_500;
+/// Longest time spent on looking ahead in one turn of the main loop: 0.2 ms.
+const FILL: u64 = 25_000;
 /// From the launch to the first tick of a program: 200 µs of the safe word.
 const LEAD_IN: u64 = 25_000;
 /// Time kept for the launch itself: 100 µs.

@@ -103,8 +103,10 @@ pub(super) fn exposure(host: &mut Host, _: bool) -> Result<Outcome, String> {
     let Some(bench) = host.target.bench() else { return Ok(Outcome::Cannot(NO_BENCH)) };
     bench.wire(6, gpio(8));
     let widths: Vec<u32> = (0..12).map(|n| 20 * US + 37 * n).collect();
-    let program: Vec<Instruction> =
+    let mut program: Vec<Instruction> =
         widths.iter().flat_map(|&width| [set(shutter(), 200 * US), clear(shutter(), width)]).collect();
+    // The end of the last exposure is seen a little after the line.
+    program.push(Instruction::Delay { ticks: 100 * US });
     let ran = host.play(&program)?;
     done(&ran)?;
     let after: Vec<u32> = ran
