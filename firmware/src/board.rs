@@ -100,7 +100,13 @@ pub struct Board {
     pub inputs: u8,
     /// Ticks that the board needs to act on an input: no wait ends sooner after its trigger.
     pub input_latency: u32,
+    /// Ticks from the reception of `Start` to the first tick of the program: time for a player in
+    /// hardware to be filled.
+    pub start_lead: u64,
 }
+
+/// [`Board::start_lead`] of a board that needs no more (1 ms).
+pub const START_LEAD: u64 = 125_000;
 
 /// Capabilities that this firmware plays; a board may claim no other.
 pub const PLAYED: u32 = Capabilities::SIMULATED
@@ -139,6 +145,7 @@ impl Board {
             cameras: 2,
             inputs: 2,
             input_latency: 50 * TICKS_PER_MICROSECOND,
+            start_lead: START_LEAD,
         }
     }
 

@@ -7,16 +7,13 @@ use crate::outputs::{AXES, LEDS, Outputs};
 use crate::player::{Player, Progress, Stage, trigger_edges, unhomed};
 use crate::replies::{Replies, Seen};
 use crate::self_test;
+use crate::stream::Source;
 use crate::verifier::{Checker, Choice};
 use daic_protocol::channels::{EXPOSURE_MASK, INTERLOCK, LIMIT_MASK};
 use daic_protocol::frame::{Decoder, Fed, FrameBytes, TooLarge, encode_reply};
 use daic_protocol::limits::*;
 use daic_protocol::message::*;
 use daic_protocol::program::{ProgramBytes, decode};
-
-/// Ticks from the reception of `Start` to the first tick of the program (1 ms): time for a player
-/// in hardware to be filled.
-pub const START_LEAD: u64 = 125_000;
 
 /// At the end of a run, camera triggers at least so old that had no exposure are told as missing (1 ms).
 const EXPOSURE_GRACE: u64 = 125_000;
@@ -40,7 +37,12 @@ pub struct Controller {
     start: u64,
     /// When the host was last heard.
     host: u64,
+    /// The host's silence has been noticed: what it says comes too late.
+    host_lost: bool,
     now: u64,
+    /// Words up to this tick are out of hand.
+    horizon: u64,
+    health: Health,
 }
 
 impl Controller {
@@ -59,7 +61,10 @@ impl Controller {
             player: None,
             start: 0,
             host: 0,
+            host_lost: false,
             now: 0,
+            horizon: 0,
+            health: Health::default(),
         }
     }
 
@@ -137,7 +142,9 @@ impl Controller {
         for &byte in bytes {
             if let Fed::Message { id, crc, message } = self.decoder.feed_request(byte) {
                 self.play(now, sink);
-                self.host = self.host.max(now);
+                if !self.host_lost {
+                    self.host = self.host.max(now);
+                }
                 self.answer(now, id, crc, &message, sink, reply);
             }
         }
@@ -169,22 +176,95 @@ impl Controller {
             let program = self.loader.stream().map(|s| s.hash()).or(self.loader.hash()).unwrap_or(0);
             self.out.note(self.start, EventKind::RunStarted { run: self.run, program });
         }
-        let mut stage = Stage { board: &self.board, out: &mut self.out, sink, host: self.host };
+        // What a player in hardware has been given cannot be taken back: the silence counts from there on.
+        if self.horizon > 0
+            && !self.host_lost
+            && let Some(deadline) = player.silence_ends(self.host).filter(|d| *d <= self.now)
+        {
+            self.host = self.host.saturating_add(self.horizon.saturating_sub(deadline));
+            self.host_lost = true;
+        }
+        let mut stage = Stage { board: &self.board, out: &mut self.out, sink, host: self.host, blind: false };
         let progress = player.play(until, known, self.loader.source(), &mut stage);
         self.conclude(progress, sink);
     }
 
+    /// A player in hardware has been given everything before `tick`: `Stop` ends the run with the
+    /// instruction that is current then.
+    pub fn committed(&mut self, tick: u64) {
+        self.horizon = self.horizon.max(tick);
+    }
+
+    /// A player in hardware needs the next instruction of a stream now: what comes later comes too late.
+    pub fn seal_stream(&mut self) {
+        self.loader.seal_stream();
+    }
+
+    /// The outputs have gone safe at `tick` without being told to; a run that is under way ends.
+    pub fn trip(&mut self, cause: FaultCause, tick: u64, sink: &mut dyn Sink) {
+        if self.player.is_none() {
+            return;
+        }
+        // What came out until then has happened.
+        let before = tick.saturating_sub(1);
+        if let Some((player, begun)) = &mut self.player
+            && (*begun || self.start <= before)
+        {
+            if !*begun {
+                *begun = true;
+                (self.out.words, self.out.events) = (0, 0);
+                let program = self.loader.stream().map(|s| s.hash()).or(self.loader.hash()).unwrap_or(0);
+                self.out.note(self.start, EventKind::RunStarted { run: self.run, program });
+            }
+            let mut stage =
+                Stage { board: &self.board, out: &mut self.out, sink, host: self.host, blind: true };
+            let known = self.now.min(before);
+            if let Progress::Ended(tick) = player.play(before, known, self.loader.source(), &mut stage) {
+                return self.end(tick, sink);
+            }
+        }
+        self.fail(cause, tick.max(self.out.last()), sink);
+    }
+
+    /// Outputs are to go safe at `tick`, or as soon after it as the board can.
+    fn halt(&mut self, cause: FaultCause, tick: u64, sink: &mut dyn Sink) {
+        let halted = sink.halt(tick);
+        if halted > tick { self.trip(cause, halted, sink) } else { self.fail(cause, tick, sink) }
+    }
+
+    /// What the board tells about itself in `Health`.
+    pub fn set_health(&mut self, health: Health) {
+        self.health = health;
+    }
+
+    pub(crate) fn cursor(&self) -> Option<(&Player, &Outputs)> {
+        self.player.as_ref().map(|(player, _)| (player, &self.out))
+    }
+
+    pub(crate) fn source_ahead(&self) -> Source<'_> {
+        self.loader.source_ahead()
+    }
+
+    /// When the host was last heard, for one who reads ahead: as long as it is not lost, just now.
+    pub(crate) fn host_ahead(&self) -> u64 {
+        if self.host_lost { self.host } else { u64::MAX }
+    }
+
+    pub(crate) fn stop_from(&self) -> Option<u64> {
+        self.player.as_ref().and_then(|(player, _)| player.stop_from())
+    }
+
     fn conclude(&mut self, progress: Progress, sink: &mut dyn Sink) {
         match progress {
-            Progress::Waiting => {}
+            Progress::Waiting | Progress::Later(_) => {}
             Progress::Ended(tick) => self.end(tick, sink),
             Progress::Failed(cause, tick) => {
                 let tick = self.out.earliest_safe(tick.max(self.out.last()));
-                self.fail(cause, tick, sink);
+                self.halt(cause, tick, sink);
             }
             Progress::Broken => {
                 let tick = self.out.earliest_safe(self.out.last());
-                self.fail(FaultCause::Internal, tick, sink);
+                self.halt(FaultCause::Internal, tick, sink);
             }
         }
     }
@@ -217,7 +297,7 @@ impl Controller {
                 && let Some(axis) = player.blocked(&self.out)
             {
                 let tick = self.out.earliest_safe(tick.max(self.out.last()));
-                return self.fail(FaultCause::LimitSwitch { axis }, tick, sink);
+                return self.halt(FaultCause::LimitSwitch { axis }, tick, sink);
             }
         }
         if changed & INTERLOCK != 0 && word & INTERLOCK == 0 && self.has_interlock() {
@@ -239,7 +319,8 @@ impl Controller {
         match (&mut self.player, self.state) {
             (Some((player, _)), _) => {
                 let reaction = player.policy().interlock;
-                let mut stage = Stage { board: &self.board, out: &mut self.out, sink, host: self.host };
+                let mut stage =
+                    Stage { board: &self.board, out: &mut self.out, sink, host: self.host, blind: false };
                 let progress = player.react(tick, FaultCause::Interlock, reaction, &mut stage);
                 self.conclude(progress, sink);
             }
@@ -317,6 +398,7 @@ impl Controller {
         self.player.as_ref().map_or(0, |(player, _)| u16::try_from(player.index()).unwrap_or(u16::MAX))
     }
 
+    #[inline(never)]
     fn answer(
         &mut self,
         now: u64,
@@ -345,6 +427,7 @@ impl Controller {
         }
     }
 
+    #[inline(never)]
     fn carry_out(
         &mut self,
         now: u64,
@@ -360,6 +443,7 @@ impl Controller {
             Request::StreamStatus => return self.stream_reply(id, Ok(())),
             Request::Inputs => return encode_reply(id, &Reply::Inputs(self.input_counts())),
             Request::Slots => return encode_reply(id, &Reply::Slots(sink.slots())),
+            Request::Health => return encode_reply(id, &Reply::Health(self.health)),
             Request::SelfTest => return encode_reply(id, &self.self_test(sink)),
             Request::StreamBegin => {
                 let begun = self.stream_begin();
@@ -479,6 +563,7 @@ impl Controller {
         encode_reply(id, &reply)
     }
 
+    #[inline(never)]
     fn stream_begin(&mut self) -> Result<(), Refusal> {
         match self.state {
             State::Running | State::Faulted => self.wrong_state(),
@@ -566,6 +651,7 @@ impl Controller {
         }
     }
 
+    #[inline(never)]
     fn start(&mut self) -> Result<(), Refusal> {
         if self.state != State::Armed {
             return self.wrong_state();
@@ -576,7 +662,7 @@ impl Controller {
         if self.is_interlocked() {
             return Err(Refusal::InterlockOpen);
         }
-        let start = self.now.max(self.out.last()).saturating_add(START_LEAD);
+        let start = self.now.max(self.out.last()).saturating_add(self.board.start_lead);
         // The proof begins with nothing owed.
         if let Some((ticks, led)) = self.out.owed(start) {
             return Err(Refusal::Cooling { led, ticks });
@@ -585,6 +671,8 @@ impl Controller {
             return Err(Refusal::NotHomed { axis });
         }
         self.start = start;
+        self.horizon = 0;
+        self.host_lost = false;
         self.player = Some((Player::new(start, self.board.input_latency), false));
         self.run = self.run.wrapping_add(1);
         self.state = State::Running;
@@ -605,7 +693,7 @@ impl Controller {
 
     fn stop(&mut self) -> Result<(), Refusal> {
         match (self.state, &mut self.player) {
-            (State::Running, Some((player, _))) => player.stop(self.now),
+            (State::Running, Some((player, _))) => player.stop(self.now.max(self.horizon)),
             (State::Armed, _) => self.disarm(),
             _ => return self.wrong_state(),
         }
@@ -616,7 +704,7 @@ impl Controller {
         match self.state {
             State::Running => {
                 let tick = self.out.earliest_safe(self.now.max(self.out.last()));
-                self.fail(FaultCause::Aborted, tick, sink);
+                self.halt(FaultCause::Aborted, tick, sink);
             }
             State::Armed => self.disarm(),
             State::Empty | State::Loaded | State::Faulted => {}

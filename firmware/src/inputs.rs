@@ -9,7 +9,7 @@ use heapless::Deque;
 const TRIGGERS_KEPT: usize = 8;
 
 /// Levels and counters.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct InputLog {
     /// The input word at tick `known`.
     pub(crate) word: u32,
@@ -21,7 +21,7 @@ pub(crate) struct InputLog {
 }
 
 /// One camera.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Exposure {
     triggers: Deque<u64, TRIGGERS_KEPT>,
     began: Option<u64>,

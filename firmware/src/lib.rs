@@ -8,6 +8,8 @@
 //! * [`motion`]: when each step of a move is made.
 //! * [`board`]: what a board has and what may be done with it.
 //! * [`levels`]: LED levels by PWM and by external converters.
+//! * [`Ahead`], [`blocks`], [`slots`], [`links`]: what a board with a player in hardware needs beside it.
+//! * [`pico`]: the Raspberry Pi Pico as a board.
 #![no_std]
 #![forbid(unsafe_code)]
 #![cfg_attr(
@@ -21,23 +23,29 @@
     )
 )]
 
+mod ahead;
+pub mod blocks;
 pub mod board;
 mod controller;
 mod events;
 mod guard;
 mod inputs;
 pub mod levels;
+pub mod links;
 mod loader;
 pub mod motion;
 mod outputs;
+pub mod pico;
 mod player;
 mod replies;
 mod self_test;
+pub mod slots;
 mod stream;
 pub mod verifier;
 
-pub use board::{AxisLimits, Board, Homing, LedLimits, Overdrive, PLAYED};
-pub use controller::{Controller, START_LEAD};
+pub use ahead::{Ahead, Reached};
+pub use board::{AxisLimits, Board, Homing, LedLimits, Overdrive, PLAYED, START_LEAD};
+pub use controller::Controller;
 pub use replies::READ_CACHE;
 
 use daic_protocol::limits::MAX_SLOTS;
@@ -50,6 +58,17 @@ pub trait Sink {
     fn word(&mut self, tick: u64, word: u32);
     /// At about `tick` LED `led` gets `level` (PWM or DAC, not tick-exact).
     fn level(&mut self, tick: u64, led: u8, level: u16);
+
+    /// No word can be taken now: playing pauses, and goes on when it is asked to play again.
+    fn is_full(&self) -> bool {
+        false
+    }
+
+    /// All outputs must be safe from `tick` on; returns the tick from which they are. What plays on time by
+    /// itself goes safe at `tick`; what has been given words beyond it goes safe at once.
+    fn halt(&mut self, tick: u64) -> u64 {
+        tick
+    }
 
     /// Keeps a program in a slot. Whatever happens meanwhile, the slot holds the old program or the new
     /// one, never a part of either.

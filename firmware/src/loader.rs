@@ -51,6 +51,21 @@ impl Loader {
         }
     }
 
+    /// What is played, for one who reads ahead.
+    pub(crate) fn source_ahead(&self) -> Source<'_> {
+        match &self.stream {
+            Some(stream) => Source::Ahead(stream, &self.staged),
+            None => Source::Stored(&self.live),
+        }
+    }
+
+    /// The stream takes nothing any more.
+    pub(crate) fn seal_stream(&mut self) {
+        if let Some(stream) = &mut self.stream {
+            stream.seal();
+        }
+    }
+
     /// The stream, if there is one.
     pub(crate) fn stream(&self) -> Option<&Stream> {
         self.stream.as_ref()
@@ -97,7 +112,7 @@ impl Loader {
         self.staged.clear();
         fetch(&mut self.staged)?;
         verifier::verify(&self.staged, board).map_err(Refusal::Invalid)?;
-        core::mem::swap(&mut self.live, &mut self.staged);
+        self.replace();
         self.hash = Some(program::hash(&self.live));
         self.staged.clear();
         Ok(())
@@ -151,10 +166,17 @@ impl Loader {
             return Err(Refusal::HashDiffers { computed, given: hash });
         }
         verifier::verify(&self.staged, board).map_err(Refusal::Invalid)?;
-        core::mem::swap(&mut self.live, &mut self.staged);
+        self.replace();
         self.hash = Some(hash);
         self.abort();
         Ok(())
+    }
+
+    /// What is staged becomes the program. Copied in place: swapped they would need room for both on the stack.
+    fn replace(&mut self) {
+        self.live.clear();
+        // Both have the same capacity.
+        let _ = self.live.extend_from_slice(&self.staged);
     }
 
     pub(crate) fn abort(&mut self) {

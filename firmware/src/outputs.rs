@@ -15,7 +15,7 @@ pub(crate) const AXES: usize = daic_protocol::channels::AXES as usize;
 pub(crate) const LEDS: usize = daic_protocol::channels::LEDS as usize;
 
 /// Outputs, positions, inputs and events.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct Outputs {
     pub(crate) word: u32,
     /// Tick of the last word, if there was one.

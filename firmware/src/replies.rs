@@ -70,7 +70,8 @@ impl Replies {
             | Request::StreamStatus
             | Request::Inputs
             | Request::Slots
-            | Request::SelfTest => self.reads.keep(id, crc, frame),
+            | Request::SelfTest
+            | Request::Health => self.reads.keep(id, crc, frame),
             _ => self.effects.keep(id, crc, frame),
         }
     }

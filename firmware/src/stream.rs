@@ -14,8 +14,10 @@ pub(crate) enum Fetched {
     Instruction(Instruction, usize),
     /// The end of the program.
     End,
-    /// Nothing yet.
+    /// Nothing, and nothing will come in time.
     Dry,
+    /// Nothing yet.
+    Later,
     /// No instruction.
     Broken,
 }
@@ -27,6 +29,8 @@ pub(crate) enum Source<'a> {
     Stored(&'a [u8]),
     /// What has come so far, and the ring it is in.
     Stream(&'a mut Stream, &'a ProgramBytes),
+    /// The same for one who reads ahead of the player.
+    Ahead(&'a Stream, &'a ProgramBytes),
 }
 
 impl Source<'_> {
@@ -38,6 +42,10 @@ impl Source<'_> {
                 None => Fetched::Broken,
             },
             Self::Stream(stream, ring) => stream.fetch(offset, ring),
+            Self::Ahead(stream, ring) => match stream.fetch(offset, ring) {
+                Fetched::Dry if !stream.sealed => Fetched::Later,
+                fetched => fetched,
+            },
         }
     }
 
@@ -64,6 +72,8 @@ pub(crate) struct Stream {
     instructions: u32,
     begun: u32,
     ended: bool,
+    /// What comes now comes too late.
+    sealed: bool,
     hasher: Hasher,
     checker: Checker,
     /// Axes that know where they are once what was checked has been played.
@@ -90,6 +100,7 @@ impl Stream {
             instructions: 0,
             begun: 0,
             ended: false,
+            sealed: false,
             hasher: Hasher::new(),
             checker,
             homed,
@@ -114,6 +125,11 @@ impl Stream {
 
     pub(crate) fn hash(&self) -> u32 {
         self.hasher.finish()
+    }
+
+    /// Takes nothing any more: the run ends with what there is.
+    pub(crate) fn seal(&mut self) {
+        self.sealed = true;
     }
 
     pub(crate) fn is_empty(&self) -> bool {
@@ -160,7 +176,7 @@ impl Stream {
         if fresh.is_empty() {
             return Ok(());
         }
-        if self.ended {
+        if self.ended || self.sealed {
             return Err(Refusal::StreamEnded { length: self.checked });
         }
         if end > limit {

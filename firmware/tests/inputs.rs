@@ -84,7 +84,7 @@ fn time_runs_out() {
         run(small_board(), &program, &[(5, 0)])
     };
     let (start, rig) = ends(Timeout::Continue);
-    assert_eq!(rig.out.words[0].0, start + 300);
+    assert_eq!(rig.out.words[0].0, start + 320);
     let (_, rig) = ends(Timeout::Stop);
     assert_eq!((rig.out.words.len(), rig.controller.state()), (0, State::Loaded));
     let (start, mut rig) = ends(Timeout::Fault);

@@ -537,5 +537,6 @@ fn board(config: &BoardConfig) -> Board {
         cameras: config.cameras,
         inputs: config.inputs,
         input_latency: config.input_latency,
+        start_lead: daic_firmware::START_LEAD,
     }
 }

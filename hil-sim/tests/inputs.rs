@@ -63,7 +63,7 @@ fn a_trigger_at_the_last_tick_of_a_wait_counts_and_one_later_does_not() {
     assert_eq!(found, None);
     let last = begin + u64::from(timeout);
     assert_eq!(play(last), (begin, Some(u64::from(timeout)), u64::from(timeout) + 7000));
-    assert_eq!(play(last + 1), (begin, None, u64::from(timeout)));
+    assert_eq!(play(last + 1), (begin, None, u64::from(timeout) + 7000));
     assert_eq!(play(begin), (begin, Some(0), 7000));
 }
 

@@ -67,7 +67,7 @@ fn a_wait_ends_where_its_trigger_came() {
         Err(ExpandError::DependsOnInput { instruction: 0, on: "a trigger" })
     );
     let ended = [Answer::Triggered(300), Answer::TimedOut];
-    let expected = vec![(1300, 1), (1320, 0), (51_320, 1), (51_340, 0)];
+    let expected = vec![(1300, 1), (1320, 0), (52_320, 1), (52_340, 0)];
     assert_eq!(
         (expand_with(&program, position, Waits::Ended(&ended)), words),
         (Ok(expected.clone()), expected)

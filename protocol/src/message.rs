@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 /// Hash (CRC-32/ISO-HDLC) over the golden bytes of all messages, in the order of `tests/golden.rs`,
 /// which computes it anew. A change means that the messages have changed.
-pub const SCHEMA_HASH: u32 = 0xc7ef_6d10;
+pub const SCHEMA_HASH: u32 = 0x6bab_7c13;
 
 /// From host to box. The frame header carries the request id.
 // Nothing here can be boxed: there is no allocator.
@@ -105,6 +105,8 @@ pub enum Request {
     Slots,
     /// Test the box itself; outputs do not change.
     SelfTest,
+    /// How the board itself is doing.
+    Health,
 }
 
 /// When a stored program starts without a host. Append-only.
@@ -151,6 +153,41 @@ pub enum Reply {
     Slots(Vec<SlotInfo, MAX_SLOTS>),
     /// Answer to `SelfTest`.
     SelfTest(SelfTest),
+    /// Answer to `Health`.
+    Health(Health),
+}
+
+/// How the board itself is doing; all zero from a board that does not measure itself.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Health {
+    /// Why the board last started.
+    pub reset: ResetCause,
+    /// Bytes of memory between variables and the top of the stack.
+    pub stack_size: u32,
+    /// Most bytes of stack ever in use since the start.
+    pub stack_peak: u32,
+    /// Bytes received while there was no room for them.
+    pub received_lost: u32,
+    /// Replies dropped because nobody took the ones before.
+    pub replies_lost: u32,
+    /// Least ticks by which words were ready before their time in the last run.
+    pub lead: u32,
+    /// Longest turn of the main loop since the start, in ticks.
+    pub turn: u32,
+}
+
+/// Why a board last started. Append-only.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum ResetCause {
+    /// Not known, or power was switched on.
+    #[default]
+    Power,
+    /// The watchdog: the program hung.
+    Watchdog,
+    /// The program found an impossible state, made the outputs safe and started anew.
+    Panic,
+    /// The processor refused an instruction or an access.
+    HardFault,
 }
 
 /// How far a stream is. All byte counts are absolute: counted from the beginning of the stream.
@@ -588,6 +625,8 @@ pub enum FaultCause {
         /// LED.
         led: u8,
     },
+    /// The processor did not report in time.
+    Heartbeat,
 }
 
 /// Answer to `ReadEvents`.

@@ -76,6 +76,7 @@ fn requests() -> Vec<(Request, &'static str)> {
         (Request::SlotErase { slot: 2 }, "14 02"),
         (Request::Slots, "15"),
         (Request::SelfTest, "16"),
+        (Request::Health, "17"),
     ]
 }
 
@@ -154,6 +155,18 @@ fn replies() -> Vec<(Reply, &'static str)> {
         (Reply::Inputs(inputs), "07 81 80 80 08 01 00 00 00 00 00 00 00 00 80 01 00 00 00 00 00 00 05"),
         (Reply::Slots([slot].into_iter().collect()), "08 01 02 e1 03 ef fd b6 f5 0d 01"),
         (Reply::SelfTest(SelfTest { made: 0x1_003f, failed: 2 }), "09 bf 80 04 02"),
+        (
+            Reply::Health(Health {
+                reset: ResetCause::Watchdog,
+                stack_size: 200_000,
+                stack_peak: 9000,
+                received_lost: 1,
+                replies_lost: 2,
+                lead: 1_250_000,
+                turn: 128,
+            }),
+            "0a 01 c0 9a 0c a8 46 01 02 d0 a5 4c 80 01",
+        ),
     ]
 }
 
@@ -236,6 +249,16 @@ fn causes() -> Vec<(FaultCause, &'static str)> {
         (FaultCause::TriggerTimeout { input: 2 }, "06 02"),
         (FaultCause::HomingFailed { axis: 3 }, "07 03"),
         (FaultCause::LedLimit { led: 4 }, "08 04"),
+        (FaultCause::Heartbeat, "09"),
+    ]
+}
+
+fn resets() -> Vec<(ResetCause, &'static str)> {
+    vec![
+        (ResetCause::Power, "00"),
+        (ResetCause::Watchdog, "01"),
+        (ResetCause::Panic, "02"),
+        (ResetCause::HardFault, "03"),
     ]
 }
 
@@ -367,6 +390,7 @@ fn every_message_has_its_bytes() {
         check(&conditions(), &[]),
         check(&timeouts(), &[]),
         check(&reactions(), &[]),
+        check(&resets(), &[]),
     ];
     let hash = crc32(&lists.concat());
     assert_eq!(hash, SCHEMA_HASH, "the messages have changed: the schema hash is now {hash:#010x}");

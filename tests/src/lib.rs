@@ -2,6 +2,7 @@
 //! reproduction of the thesis.
 
 pub mod expansion;
+pub mod hil;
 pub mod program;
 pub mod reproduce;
 pub mod shared;

@@ -1,10 +1,13 @@
-//! The one entry for people and CI: `cargo xtask test | lint | figures | reproduce | bench`.
+//! The one entry for people and CI: `cargo xtask test | lint | firmware | hil | figures | reproduce | bench`.
 //!
 //! Every step runs even when an earlier one failed, and the end names what passed, what failed
 //! and what could not be run on this machine, with the reason.
 
 mod bench;
 mod campaign;
+mod datasheet;
+mod firmware;
+mod hil;
 mod steps;
 
 use std::process::ExitCode;
@@ -12,16 +15,21 @@ use std::process::ExitCode;
 const USAGE: &str = "\
 cargo xtask COMMAND
 
-  test       everything that proves the project: unit, property and whole-chain tests, the
-             firmware for thumbv6m-none-eabi (brings its toolchain into target/), the examples
+  test       everything that proves the project: unit, property and whole-chain tests,
+             the Pico's image (brings its toolchain into target/) and the cases on it in an emulator
+  firmware   the Pico's image as ELF and UF2, in target/firmware/
+  hil        [--target inprocess|pty|pico] [--port PORT] [--long] [--filter TEXT]: the same cases on the
+             controller, on the simulated board, on the emulated Pico, on the board at PORT
+             --faults N: N more runs of the fault campaign; totals in docs/campaigns/faults.json
+             --verifier [--long]: 10 000 (1 000 000 more) random programs through the verifier
   lint       formatting, clippy, documentation without warnings, cargo-deny where installed
   ci         test, then lint
+  datasheet  measures on the emulated Pico and writes the numbers into docs/datasheet.md
   figures    draws the pictures of README and docs anew with the program itself
   coverage   2 000 simulated calibrations: what the stated uncertainties cover (minutes)
   reproduce  macro: chapter 2 of the thesis, micro: chapter 3, lightfield: chapter 4 (about an
              hour), simulated and measured, into docs/reproduction.md
-  hil        --faults N: N more runs of the fault campaign; totals in docs/campaigns/faults.json
-             --verifier [--long]: 10 000 (1 000 000) random programs through the verifier
+  fuzz       [--long]: each fuzz target for a minute (an hour); needs a nightly compiler and cargo-fuzz
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders
              lightfield: speed and memory beside pyolaf, into docs/performance.md
@@ -39,14 +47,23 @@ fn main() -> ExitCode {
             report.append(steps::lint());
             report
         }
+        ["firmware"] => {
+            let mut report = steps::Report::default();
+            report.step("firmware for the Pico", firmware::build);
+            report
+        }
+        ["datasheet"] => hil::datasheet(),
         ["figures"] => steps::figures(),
         ["coverage"] => steps::coverage(),
         ["reproduce", chapter @ ("macro" | "micro" | "lightfield")] => steps::reproduce(chapter),
         ["hil", "--faults", count] if count.parse::<u64>().is_ok() => {
             campaign::faults(count.parse().unwrap_or(0))
         }
-        ["hil", "--verifier"] => campaign::verifier(10_000),
-        ["hil", "--verifier", "--long"] => campaign::verifier(1_000_000),
+        ["hil", "--verifier"] => campaign::verifier(),
+        ["hil", "--verifier", "--long"] => campaign::verifier_long(100),
+        ["hil", ..] => hil::hil(&words[1..]),
+        ["fuzz"] => campaign::fuzz(60),
+        ["fuzz", "--long"] => campaign::fuzz(3600),
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),
         ["bench", "lightfield"] => bench::lightfield::lightfield(),

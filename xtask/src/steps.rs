@@ -27,6 +27,11 @@ impl Report {
         self.0.iter().any(|(_, outcome, _)| matches!(outcome, Outcome::Failed(_)))
     }
 
+    /// Whether the last two steps did what they should.
+    pub fn last_two_passed(&self) -> bool {
+        self.0.iter().rev().take(2).all(|(_, outcome, _)| matches!(outcome, Outcome::Passed))
+    }
+
     pub fn print(&self) {
         println!("\nsummary");
         for (name, outcome, took) in &self.0 {
@@ -72,7 +77,7 @@ pub fn test() -> Report {
     report.step("distortion map of a simulated target", || {
         distortion_map(&root().join("target/line-target"), "480x360", Profile::Debug)
     });
-    report.step("firmware for thumbv6m-none-eabi", thumb);
+    crate::hil::pico(&mut report, &["--target", "pico"]);
     report.step("instruction counts of the correlation (callgrind)", || crate::bench::guard::guard(false));
     report.step("data of others", || {
         let shared = std::env::var_os("DAIC_SHARED").map_or_else(|| root().join("../shared"), PathBuf::from);
@@ -149,47 +154,14 @@ fn distortion_map(folder: &Path, size: &str, profile: Profile) -> Outcome {
     outcome_of(calibrate)
 }
 
-/// Builds protocol and firmware for the Pico's core, with a toolchain brought into `target/thumb`
-/// where rustup has none.
-fn thumb() -> Outcome {
-    let script = root().join("ci/thumb-toolchain.sh");
-    let output = match Command::new("bash").arg(&script).stderr(std::process::Stdio::inherit()).output() {
-        Ok(output) => output,
-        Err(error) => return Outcome::NotRun(format!("bash did not start: {error}")),
-    };
-    if !output.status.success() {
-        return Outcome::NotRun(format!(
-            "no Rust toolchain for thumbv6m-none-eabi could be had ({}); `rustup target add thumbv6m-none-eabi` brings one",
-            output.status
-        ));
-    }
-    let environment = String::from_utf8_lossy(&output.stdout);
-    let mut build = cargo(&[
-        "build",
-        "--locked",
-        "--release",
-        "--target",
-        "thumbv6m-none-eabi",
-        "-p",
-        "daic-protocol",
-        "-p",
-        "daic-firmware",
-    ]);
-    // a directory of its own: the compiler may be another than the one that built the rest
-    build.env("CARGO_TARGET_DIR", root().join("target/thumb-build"));
-    for line in environment.lines() {
-        for pair in line.strip_prefix("export ").unwrap_or_default().split_whitespace() {
-            if let Some((name, value)) = pair.split_once('=') {
-                build.env(name, value);
-            }
-        }
-    }
-    outcome_of(build)
-}
-
 pub fn lint() -> Report {
     let mut report = Report::default();
     report.step("formatting", || outcome_of(cargo(&["fmt", "--all", "--check"])));
+    report.step("formatting of the Pico's program", || {
+        let mut command = cargo(&["fmt", "--check", "--manifest-path"]);
+        command.arg(root().join("firmware/boards/pico/Cargo.toml"));
+        outcome_of(command)
+    });
     report.step("clippy", || {
         outcome_of(cargo(&["clippy", "--workspace", "--all-targets", "--locked", "--", "-D", "warnings"]))
     });

@@ -53,26 +53,39 @@ impl SCurve {
         if steps == 0 {
             return plan;
         }
+        // In slices of one tick; wide divisions are dear on a small processor, so there are three in all.
+        let (by_rate, by_acceleration, by_jerk) = (nf.div_ceil(v), nf2.div_ceil(a), nf3.div_ceil(j));
         for shift in MIN_SLICE_SHIFT..=MAX_SLICE_SHIFT {
-            let up = |numerator: u128, divisor: u128, power: u32| {
-                let divisor = divisor.checked_shl(shift.saturating_mul(power)).unwrap_or(u128::MAX);
-                numerator.div_ceil(divisor.max(1)).max(1)
+            let up = |whole: u128, power: u32| {
+                let bits = shift.saturating_mul(power);
+                let floor = whole.checked_shr(bits).unwrap_or(0);
+                let is_exact = floor.checked_shl(bits) == Some(whole);
+                floor.saturating_add(u128::from(!is_exact)).max(1)
             };
             // Slices that would be needed at M = 1; all three are divided by M below.
-            let (rate_slices, pa, pj) = (up(nf, v, 1), up(nf2, a, 2), up(nf3, j, 3));
-            let boxes = |m: u128| {
+            let wide = (up(by_rate, 1), up(by_acceleration, 2), up(by_jerk, 3));
+            let limit = MAX_SLICES;
+            let (square, cube) =
+                (limit.saturating_mul(limit), limit.saturating_mul(limit).saturating_mul(limit));
+            let fit = |x: u128, most: u64| u64::try_from(x).ok().filter(|x| *x <= most);
+            // More than that does not fit, whatever M is.
+            let (Some(rate_slices), Some(pa), Some(pj)) =
+                (fit(wide.0, limit), fit(wide.1, square), fit(wide.2, cube))
+            else {
+                continue;
+            };
+            let boxes = |m: u64| {
                 let root = pj.div_ceil(m);
                 let floor = root.isqrt();
                 let root = if floor.saturating_mul(floor) < root { floor.saturating_add(1) } else { floor };
                 let p = pa.div_ceil(m).max(root);
                 (p, pj.div_ceil(m.saturating_mul(p)).clamp(1, p))
             };
-            let fits = |m: u128| {
+            let fits = |m: u64| {
                 let (p, q) = boxes(m);
                 p.saturating_add(q) <= m
             };
-            let limit = u128::from(MAX_SLICES);
-            if rate_slices > limit || !fits(limit) {
+            if !fits(limit) {
                 continue;
             }
             let (mut low, mut high) = (rate_slices, limit);
@@ -86,8 +99,7 @@ impl SCurve {
             }
             let (p, q) = boxes(high);
             if p.saturating_add(q).saturating_add(high) <= limit {
-                let narrow = |x: u128| u64::try_from(x).unwrap_or(u64::MAX);
-                plan = Self { steps, shift, q: narrow(q), p: narrow(p), m: narrow(high) };
+                plan = Self { steps, shift, q, p, m: high };
                 break;
             }
         }
@@ -166,12 +178,62 @@ impl SCurve {
         Some(low.checked_shl(self.shift).unwrap_or(u64::MAX).saturating_add(within))
     }
 
-    /// ⌊S x / width⌋ and the remainder.
+    /// ⌊S x / width⌋ and the remainder; `width` is below 2⁶³. Bit by bit: S is a power of two, and a division of
+    /// 128 bits is dear on a small processor.
     fn divide(&self, x: u64, width: u64) -> (u64, u64) {
-        let scaled = u128::from(x).checked_shl(self.shift).unwrap_or(0);
-        let width = u128::from(width.max(1));
-        let narrow = |x: u128| u64::try_from(x).unwrap_or(u64::MAX);
-        (narrow(scaled.checked_div(width).unwrap_or(0)), narrow(scaled.checked_rem(width).unwrap_or(0)))
+        let width = width.max(1);
+        let (mut quotient, mut rest) = if x < width {
+            (0, x)
+        } else {
+            (x.checked_div(width).unwrap_or(0), x.checked_rem(width).unwrap_or(0))
+        };
+        for _ in 0..self.shift {
+            // The remainder is below `width`.
+            (quotient, rest) = (quotient << 1, rest << 1);
+            if let Some(less) = rest.checked_sub(width) {
+                (quotient, rest) = (quotient | 1, less);
+            }
+        }
+        (quotient, rest)
+    }
+}
+
+/// The values of box_q ∗ box_p ∗ box_M one after the other. Its generating function is
+/// (1 − z^q) (1 − z^p) (1 − z^M) / (1 − z)³: eight corners, summed up three times.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Convolution {
+    /// Index of the value.
+    at: u64,
+    /// Corners, their sums, and the value.
+    sums: [i64; 3],
+}
+
+impl Convolution {
+    fn first(curve: &SCurve) -> Self {
+        let mut first = Self { at: 0, sums: [0; 3] };
+        first.take(curve);
+        first
+    }
+
+    fn take(&mut self, curve: &SCurve) {
+        let (i, q, p, m) = (self.at, curve.q, curve.p, curve.m);
+        let is = |at: u64| i64::from(i == at);
+        let (qp, qm, pm) = (q.saturating_add(p), q.saturating_add(m), p.saturating_add(m));
+        let up = is(0).saturating_add(is(qp)).saturating_add(is(qm)).saturating_add(is(pm));
+        let down = is(q).saturating_add(is(p)).saturating_add(is(m)).saturating_add(is(qp.saturating_add(m)));
+        let [corners, slope, value] = &mut self.sums;
+        *corners = corners.saturating_add(up).saturating_sub(down);
+        *slope = slope.saturating_add(*corners);
+        *value = value.saturating_add(*slope);
+    }
+
+    fn next(&mut self, curve: &SCurve) {
+        self.at = self.at.saturating_add(1);
+        self.take(curve);
+    }
+
+    fn value(&self) -> u64 {
+        u64::try_from(self.sums[2]).unwrap_or(0)
     }
 }
 
@@ -181,8 +243,8 @@ pub struct SCurveSteps {
     curve: SCurve,
     /// Steps yielded.
     done: u32,
-    /// Slice under way, 2 N C at its begin and over its width; `None` before the first.
-    slice: u64,
+    /// Slice under way, 2 N C at its begin and over its width.
+    slice: Convolution,
     begin: u64,
     width: u64,
     /// Time of the last step within the slice and its remainder over `width`; `None` before the first
@@ -195,13 +257,14 @@ pub struct SCurveSteps {
 impl SCurveSteps {
     /// Begins with the first step.
     pub fn new(curve: SCurve) -> Self {
-        let mut steps = Self { curve, done: 0, slice: 0, begin: 0, width: 0, last: None, interval: (0, 0) };
-        steps.width = steps.end_of(0);
+        let slice = Convolution::first(&curve);
+        let mut steps = Self { curve, done: 0, slice, begin: 0, width: 0, last: None, interval: (0, 0) };
+        steps.width = steps.width_now();
         steps
     }
 
-    fn end_of(&self, slice: u64) -> u64 {
-        u64::from(self.curve.steps).saturating_mul(2).saturating_mul(self.curve.sum(slice.saturating_add(1)))
+    fn width_now(&self) -> u64 {
+        u64::from(self.curve.steps).saturating_mul(2).saturating_mul(self.slice.value())
     }
 }
 
@@ -215,10 +278,10 @@ impl Iterator for SCurveSteps {
         self.done = self.done.saturating_add(1);
         let total = self.curve.total();
         let wanted = u64::from(self.done).saturating_mul(2).saturating_sub(1).saturating_mul(total);
-        while self.begin.saturating_add(self.width) < wanted && self.slice < self.curve.count() {
-            self.slice = self.slice.saturating_add(1);
+        while self.begin.saturating_add(self.width) < wanted && self.slice.at < self.curve.count() {
+            self.slice.next(&self.curve);
             self.begin = self.begin.saturating_add(self.width);
-            self.width = self.end_of(self.slice).saturating_sub(self.begin);
+            self.width = self.width_now();
             self.last = None;
         }
         let within = match self.last {
@@ -240,6 +303,6 @@ impl Iterator for SCurveSteps {
             }
         };
         self.last = Some(within);
-        Some(self.slice.checked_shl(self.curve.shift).unwrap_or(u64::MAX).saturating_add(within.0))
+        Some(self.slice.at.checked_shl(self.curve.shift).unwrap_or(u64::MAX).saturating_add(within.0))
     }
 }

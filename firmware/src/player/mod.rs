@@ -17,7 +17,7 @@ use crate::Sink;
 use crate::board::Board;
 use crate::outputs::{AXES, Outputs};
 use crate::stream::{Fetched, Source};
-use daic_protocol::channels::{self, AXIS_MASK};
+use daic_protocol::channels::{self, AXIS_MASK, LED_MASK, LIMIT_MASK};
 use daic_protocol::limits::{MAX_LOOP_DEPTH, MIN_STEP_TICKS, TICK_HZ};
 use daic_protocol::message::{EventKind, FaultCause};
 use daic_protocol::program::{Condition, Instruction, Policy, Reaction, Timeout};
@@ -35,6 +35,8 @@ pub(crate) enum Progress {
     Ended(u64),
     /// It cannot go on: outputs are to be made safe at the tick given, or as soon as possible.
     Failed(FaultCause, u64),
+    /// The next instruction, at the tick given, has not come yet.
+    Later(u64),
     /// The program does something that the verifier should have refused.
     Broken,
 }
@@ -46,6 +48,8 @@ pub(crate) struct Stage<'a> {
     pub(crate) sink: &'a mut dyn Sink,
     /// When the host was last heard.
     pub(crate) host: u64,
+    /// Limit switches are left aside: what is played has been played, or somebody else looks after them.
+    pub(crate) blind: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -124,8 +128,8 @@ pub(crate) struct Player {
     waited: u64,
     /// The host's silence has been dealt with.
     host_lost: bool,
-    /// End after the current instruction.
-    stopping: bool,
+    /// End after the instruction that is current at this tick.
+    stopping: Option<u64>,
 }
 
 impl Player {
@@ -148,7 +152,7 @@ impl Player {
             latency: latency as u64,
             waited: 0,
             host_lost: false,
-            stopping: false,
+            stopping: None,
         }
     }
 
@@ -166,15 +170,15 @@ impl Player {
         self.waited.saturating_add(current)
     }
 
-    /// End after the current instruction; a wait that nothing has ended yet ends now.
-    pub(crate) fn stop(&mut self, now: u64) {
-        self.stopping = true;
-        // A wait would never end by itself.
-        if let Current::Trigger(wait) = self.current
-            && wait.fired.is_none()
-        {
-            self.finish(wait.since.max(now));
-        }
+    /// End after the instruction that is current at tick `from`; a wait that nothing has ended by now ends
+    /// then.
+    pub(crate) fn stop(&mut self, from: u64) {
+        self.stopping.get_or_insert(from);
+    }
+
+    /// From which tick on the run is to end.
+    pub(crate) fn stop_from(&self) -> Option<u64> {
+        self.stopping
     }
 
     /// Axes that move now.
@@ -190,13 +194,21 @@ impl Player {
 
     /// Tick of the next thing to be done; `None` while only an input can bring one.
     pub(crate) fn due(&self, out: &Outputs, host: u64) -> Option<u64> {
+        self.due_knowing(out, host, u64::MAX)
+    }
+
+    /// Nothing is done before this tick, if inputs are known up to tick `known`.
+    pub(crate) fn due_knowing(&self, out: &Outputs, host: u64, known: u64) -> Option<u64> {
         let step = self.step_due(out);
-        let (step, program) = match self.wanted(u64::MAX) {
+        // A trigger that is still to come is answered so much later.
+        let begun = if let Current::Trigger(wait) = &self.current { wait.since } else { 0 };
+        let answer = known.checked_add(1).and_then(|t| t.max(begun).checked_add(self.latency));
+        let (step, program) = match self.wanted(known) {
             // A step too close before a word comes with it.
             Next::Word(t) => (step.filter(|s| s.saturating_add(STEP) <= t), Some(t)),
             Next::Act(t) => (step, Some(t)),
             Next::Still => (step, step.or(Some(self.now))),
-            Next::Input => (step, None),
+            Next::Input => (step, answer),
         };
         let light = out.light_deadline().map(|(t, _)| t);
         let host = self.host_deadline(host);
@@ -228,10 +240,12 @@ impl Player {
                 Next::Input
             }
             Current::Home(search) => Next::Act(search.due()),
-            Current::Trigger(wait) => match (wait.fired, wait.deadline) {
-                (Some(tick), _) => Next::Act(tick.saturating_add(u64::from(wait.delay))),
-                (None, Some(deadline)) if deadline <= known => Next::Act(deadline),
-                (None, _) => Next::Input,
+            Current::Trigger(wait) => match (wait.fired, self.stopping, wait.deadline) {
+                (Some(tick), ..) => Next::Act(tick.saturating_add(u64::from(wait.delay))),
+                // A wait would never end by itself.
+                (None, Some(from), _) => Next::Act(from.max(wait.since)),
+                (None, None, Some(deadline)) if deadline <= known => Next::Act(deadline),
+                (None, None, _) => Next::Input,
             },
         }
     }
@@ -250,6 +264,12 @@ impl Player {
     ) -> Progress {
         self.look(known, stage.out);
         loop {
+            if stage.sink.is_full() {
+                return Progress::Waiting;
+            }
+            if self.plain(until, &mut source, stage).is_some() {
+                continue;
+            }
             let step = self.step_due(stage.out);
             // How far the program may be read: to within the smallest step after a step.
             let horizon =
@@ -281,6 +301,46 @@ impl Player {
                 Some(other) => return other,
                 None => return Progress::Broken,
             }
+        }
+    }
+
+    /// The commonest things in a few cycles: a word of the program with no move beside it, a word of a move with
+    /// nothing beside it, while no deadline counts. `None`: it is something else.
+    fn plain(&mut self, until: u64, source: &mut Source<'_>, stage: &mut Stage<'_>) -> Option<()> {
+        if stage.out.word & LED_MASK != 0 || self.policy.host_timeout_ms != 0 {
+            return None;
+        }
+        match self.current {
+            Current::None if self.stopping.is_none() && self.parts.is_empty() && self.now <= until => {
+                if self.motion.as_ref().is_some_and(|m| m.due().is_some()) {
+                    return None;
+                }
+                let Fetched::Instruction(Instruction::Edge { mask, value, after }, length) =
+                    source.fetch(self.offset)
+                else {
+                    return None;
+                };
+                let tick = self.now.checked_add(u64::from(after)).filter(|t| *t <= until)?;
+                let next = self.next.checked_add(1)?;
+                self.offset = self.offset.checked_add(length)?;
+                (self.index, self.next) = (self.next, next);
+                self.begun = self.begun.saturating_add(1);
+                source.consume(self.offset, self.begun);
+                stage.out.put(tick, (stage.out.word & !mask) | (value & mask), stage.sink);
+                self.now = tick;
+                Some(())
+            }
+            Current::Reach(end) if stage.blind || stage.out.inputs.word & LIMIT_MASK == 0 => {
+                let motion = self.motion.as_mut()?;
+                let tick = stage.out.earliest(motion.due()?);
+                if tick > until || tick.saturating_add(STEP) > end {
+                    return None;
+                }
+                let word = motion.advance(stage.out.word, stage.out)?;
+                stage.out.put(tick, word, stage.sink);
+                Some(())
+            }
+            _ => None,
         }
     }
 
@@ -323,6 +383,11 @@ impl Player {
         Progress::Failed(cause, tick)
     }
 
+    /// When the host's silence counts, if it was last heard at tick `host`.
+    pub(crate) fn silence_ends(&self, host: u64) -> Option<u64> {
+        self.host_deadline(host)
+    }
+
     pub(crate) fn policy(&self) -> Policy {
         self.policy
     }
@@ -330,7 +395,9 @@ impl Player {
     /// An edge of a trigger input at `tick`; false if nothing waited for it.
     pub(crate) fn trigger(&mut self, tick: u64, input: u8, rising: bool, out: &Outputs) -> bool {
         match &mut self.current {
-            Current::Trigger(wait) if wait.input == input && is_open(self.gate, &out.inputs) => {
+            Current::Trigger(wait)
+                if wait.input == input && self.stopping.is_none() && is_open(self.gate, &out.inputs) =>
+            {
                 wait.edge(tick, rising)
             }
             _ => false,
@@ -342,6 +409,7 @@ impl Player {
     pub(crate) fn look(&mut self, known: u64, out: &Outputs) {
         if let Current::Trigger(wait) = &mut self.current
             && wait.since <= known
+            && self.stopping.is_none()
         {
             wait.look(self.gate, wait.since, &out.inputs);
         }
@@ -351,6 +419,7 @@ impl Player {
     pub(crate) fn look_again(&mut self, tick: u64, out: &Outputs) {
         if let Current::Trigger(wait) = &mut self.current
             && wait.since <= tick
+            && self.stopping.is_none()
         {
             wait.look(self.gate, tick, &out.inputs);
         }
@@ -358,7 +427,7 @@ impl Player {
 
     fn step(&mut self, tick: u64, stage: &mut Stage<'_>) -> Option<Progress> {
         let motion = self.motion.as_mut()?;
-        if let Some(axis) = motion.blocked(stage.out) {
+        if let Some(axis) = motion.blocked(stage.out).filter(|_| !stage.blind) {
             return Some(Progress::Failed(FaultCause::LimitSwitch { axis }, tick));
         }
         let word = motion.advance(stage.out.word, stage.out)?;
@@ -382,7 +451,7 @@ impl Player {
             Current::None => {
                 if let Some(part) = self.parts.pop_front() {
                     self.begin(tick, part, known, stage)?;
-                } else if self.stopping {
+                } else if self.stopping.is_some_and(|from| tick >= from) {
                     self.current = Current::End;
                 } else {
                     return self.read(tick, known, source, stage);
@@ -408,6 +477,7 @@ impl Player {
                 Motion::report(tick, &moving, stage.out);
                 self.finish(tick);
             }
+            Current::Trigger(wait) if wait.fired.is_none() && self.stopping.is_some() => self.finish(tick),
             Current::Trigger(wait) => return self.triggered(tick, wait, stage),
             Current::Home(mut search) => match search.advance(tick, stage.out, stage.sink)? {
                 Found::Searching => self.current = Current::Home(search),
@@ -428,8 +498,8 @@ impl Player {
 
     fn triggered(&mut self, tick: u64, wait: Wait, stage: &mut Stage<'_>) -> Option<Progress> {
         let input = wait.input;
-        let shortest = wait.since.saturating_add(u64::from(wait.delay));
-        self.waited = self.waited.saturating_add(tick.saturating_sub(shortest));
+        let until = wait.fired.unwrap_or(tick);
+        self.waited = self.waited.saturating_add(until.saturating_sub(wait.since));
         if let Some(stamp) = wait.fired {
             let missed = stage.out.inputs.missed(input);
             stage.out.note(stamp, EventKind::Triggered { input, missed });
@@ -437,11 +507,17 @@ impl Player {
             return Some(Progress::Waiting);
         }
         stage.out.note(tick, EventKind::TimedOut { input });
+        // As after a trigger, so that a player in hardware can be filled.
+        let end = tick.saturating_add(u64::from(wait.delay));
         match wait.on_timeout {
-            Timeout::Fault => return Some(Progress::Failed(FaultCause::TriggerTimeout { input }, tick)),
-            Timeout::Continue => self.finish(tick),
+            Timeout::Fault => {
+                // What a player in hardware has been given goes on until it is halted.
+                self.current = Current::Ending(u64::MAX);
+                return Some(Progress::Failed(FaultCause::TriggerTimeout { input }, tick));
+            }
+            Timeout::Continue => self.current = Current::Wait(end, false),
             Timeout::Stop => {
-                self.finish(tick);
+                self.now = end;
                 self.current = Current::End;
             }
         }
@@ -466,6 +542,7 @@ impl Player {
                 let reaction = self.policy.underrun;
                 return Some(self.react(tick, FaultCause::Underrun, reaction, stage));
             }
+            Fetched::Later => return Some(Progress::Later(tick)),
             Fetched::Broken => return None,
         };
         self.index = self.next;
@@ -528,7 +605,7 @@ impl Player {
                 let deadline = if timeout > 0 { Some(tick.checked_add(u64::from(timeout))?) } else { None };
                 let mut wait =
                     Wait { input, condition, skip, delay, since: tick, deadline, on_timeout, fired: None };
-                if known >= tick {
+                if known >= tick && self.stopping.is_none() {
                     wait.look(self.gate, tick, &stage.out.inputs);
                 }
                 self.current = Current::Trigger(wait);

@@ -9,7 +9,7 @@ use crate::player::{SHORTEST_HOMING, capture_edges, longest_homing};
 use daic_protocol::channels;
 use daic_protocol::limits::MIN_STEP_TICKS;
 use daic_protocol::message::{Rule, Violation};
-use daic_protocol::program::{Instruction, Timeout};
+use daic_protocol::program::Instruction;
 
 /// Shortest and longest time.
 pub(super) type Span = (u64, u64);
@@ -18,16 +18,13 @@ pub(crate) type Range = (i32, i32);
 
 /// How long a wait can last.
 pub(super) fn wait_span(instruction: &Instruction, board: &Board) -> Option<Span> {
-    let (delay, timeout, goes_on) = match *instruction {
-        Instruction::Wait { delay, timeout, on_timeout, .. } => {
-            (delay, timeout, on_timeout == Timeout::Continue)
-        }
-        Instruction::WaitTrigger { timeout, .. } => (board.input_latency, timeout, false),
+    let (delay, timeout) = match *instruction {
+        Instruction::Wait { delay, timeout, .. } => (delay, timeout),
+        Instruction::WaitTrigger { timeout, .. } => (board.input_latency, timeout),
         _ => return None,
     };
-    let low = if goes_on && timeout > 0 { delay.min(timeout) } else { delay };
     let high = if timeout == 0 { FOREVER } else { u64::from(timeout).saturating_add(u64::from(delay)) };
-    Some((u64::from(low), high))
+    Some((u64::from(delay), high))
 }
 
 /// How long a move can last that begins anywhere in `from`.

@@ -175,6 +175,7 @@ pub fn small_board() -> Board {
         cameras: 1,
         inputs: 2,
         input_latency: 20,
+        start_lead: daic_firmware::START_LEAD,
     }
 }
 

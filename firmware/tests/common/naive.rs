@@ -307,6 +307,8 @@ impl Player<'_> {
         self.event(EventKind::TimedOut { input });
         if on_timeout == Timeout::Fault {
             (self.run.faulted, self.stopped) = (Some(deadline), true);
+        } else {
+            self.now = deadline + u64::from(delay);
         }
     }
 

@@ -158,6 +158,9 @@ impl Expansion<'_> {
             }
             Answer::TimedOut => {
                 self.now = self.now.saturating_add(u64::from(timeout));
+                if on_timeout == Timeout::Continue {
+                    self.now = self.now.saturating_add(u64::from(delay));
+                }
                 on_timeout == Timeout::Continue
             }
         })

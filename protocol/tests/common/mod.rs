@@ -42,6 +42,7 @@ pub fn request() -> impl Strategy<Value = Request> {
         Just(Request::ClearFault),
         any::<u32>().prop_map(|from| Request::ReadEvents { from }),
         Just(Request::Clock),
+        Just(Request::Health),
     ]
 }
 

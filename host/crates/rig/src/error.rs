@@ -130,6 +130,7 @@ fn cause_text(cause: FaultCause) -> String {
         FaultCause::LimitSwitch { axis } => return format!("axis {axis} met its limit switch"),
         FaultCause::TriggerTimeout { input } => return format!("no trigger came on input {input} in time"),
         FaultCause::HomingFailed { axis } => return format!("axis {axis} did not find its home switch"),
+        FaultCause::Heartbeat => "its processor did not report in time",
         FaultCause::LedLimit { led } => return format!("LED {led} was about to exceed a limit"),
     };
     text.to_owned()

@@ -529,6 +529,7 @@ fn unexpected(request: &Request, reply: &Reply) -> LinkError {
         Reply::Inputs(_) => "Inputs",
         Reply::Slots(_) => "Slots",
         Reply::SelfTest(_) => "SelfTest",
+        Reply::Health(_) => "Health",
     };
     LinkError::Unexpected { request: name(request), reply }
 }
@@ -558,5 +559,6 @@ fn name(request: &Request) -> &'static str {
         Request::SlotErase { .. } => "SlotErase",
         Request::Slots => "Slots",
         Request::SelfTest => "SelfTest",
+        Request::Health => "Health",
     }
 }
