@@ -63,11 +63,11 @@ fn chapter_4_on_a_small_field() {
     eprintln!("{}", part.text);
     let of = |degrees: f64| &results.angles.iter().find(|a| a.degrees == degrees).expect("an angle").widths;
     let (plain, with) = (of(0.0), of(30.0));
-    // the grating makes the bead shorter and no wider, and it is where it is
-    assert!(with.fwhm_um[2] < plain.fwhm_um[2] || !plain.fwhm_um[2].is_finite(), "{plain:?} {with:?}");
+    // the grating makes the bead shorter (9.7 against 16.5 µm) at equal lateral resolution, and it is where it is
+    assert!(with.fwhm_um[2] < 0.65 * plain.fwhm_um[2], "{plain:?} {with:?}");
     assert!((with.peak_um - 20.0).abs() <= 2.5, "{with:?}");
     for k in 0..2 {
-        assert!((with.fwhm_um[k] - lightfield::BEAD_UM).abs() < 3.0, "{with:?}");
+        assert!((with.fwhm_um[k] - plain.fwhm_um[k]).abs() < 0.6, "{plain:?} {with:?}");
     }
     assert!(results.convergence.windows(2).all(|w| w[1][2] < w[0][2]), "{:?}", results.convergence);
     for (name, _) in &part.figures {

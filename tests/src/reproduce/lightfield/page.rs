@@ -106,6 +106,10 @@ fn angles(results: &Results, text: &mut String, figures: &mut Figures) -> Result
     let plain = axial_of(0.0, None, None);
     let line = |m| [15.0, 30.0, 45.0].map(|d| axial_of(d, m, m));
     let ordered = |w: [f64; 3]| w[0] > w[1] && w[1] > w[2];
+    let run = |m| results.angles.iter().filter(|a| a.models.data == m && a.degrees > 0.0).count() >= 3;
+    if !run(v) || !run(p) {
+        return Ok(());
+    }
     for (name, widths) in [("virtual", line(v)), ("pupil", line(p))] {
         let [a, b, c] = widths.map(um);
         writeln!(
