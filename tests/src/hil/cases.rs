@@ -277,7 +277,7 @@ fn jerk(host: &mut Host, long: bool) -> Result<Outcome, String> {
 fn full_speed(host: &mut Host, long: bool) -> Result<Outcome, String> {
     let limits = daic_firmware::Board::pico().axes[0];
     let (max_rate, acceleration) = (limits.max_rate, limits.max_acceleration);
-    let target = if long { 40_000 } else { 4_000 };
+    let target = if long { 40_000 } else { 2_500 };
     let program = [
         Instruction::Move { axis: 0, target, max_rate, acceleration, jerk: 0 },
         Instruction::Join { axis: 1, target: target - 1 },
