@@ -46,5 +46,8 @@ step decode --optics rig-found/optics.toml rig/pairs.csv --out points.csv
 # the microscope, from known motions
 step calibrate microscope microscope/moves.toml --out microscope.toml --report microscope.html
 
+# a program of the trigger box as a timing diagram
+step rig timeline "$root/examples/strobe.json" --out strobe.html
+
 printf '\nthe answers against the truth\n'
 "$REHEARSAL" --check .

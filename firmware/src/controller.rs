@@ -4,7 +4,7 @@ use crate::Sink;
 use crate::board::{Board, PLAYED};
 use crate::loader::Loader;
 use crate::outputs::{AXES, LEDS, Outputs};
-use crate::player::{Player, Progress, Stage, trigger_edges};
+use crate::player::{Player, Progress, Stage, trigger_edges, unhomed};
 use crate::replies::{Replies, Seen};
 use crate::self_test;
 use crate::stream::Source;
@@ -13,7 +13,7 @@ use daic_protocol::channels::{EXPOSURE_MASK, INTERLOCK, LIMIT_MASK};
 use daic_protocol::frame::{Decoder, Fed, FrameBytes, TooLarge, encode_reply};
 use daic_protocol::limits::*;
 use daic_protocol::message::*;
-use daic_protocol::program::{Instruction, ProgramBytes, decode};
+use daic_protocol::program::{ProgramBytes, decode};
 
 /// At the end of a run, camera triggers at least so old that had no exposure are told as missing (1 ms).
 const EXPOSURE_GRACE: u64 = 125_000;
@@ -121,6 +121,12 @@ impl Controller {
     /// Hash of the committed program.
     pub fn program(&self) -> Option<u32> {
         self.loader.hash()
+    }
+
+    /// How far the stream is that has been begun, if there is one.
+    pub fn stream(&self) -> Option<StreamState> {
+        let played = if self.player.is_some() { self.played() } else { 0 };
+        self.loader.stream().map(|stream| stream.state(played))
     }
 
     /// Frames rejected since boot, by cause.
@@ -550,8 +556,7 @@ impl Controller {
     }
 
     fn stream_reply(&self, id: u32, done: Result<(), Refusal>) -> Result<FrameBytes, TooLarge> {
-        let played = if self.player.is_some() { self.played() } else { 0 };
-        let reply = match done.and_then(|()| self.loader.stream_state(played)) {
+        let reply = match done.and_then(|()| self.stream().ok_or(Refusal::NotStreaming)) {
             Ok(state) => Reply::Stream(state),
             Err(refusal) => Reply::Refused(refusal),
         };
@@ -567,7 +572,8 @@ impl Controller {
                     return Err(Refusal::NotStreaming);
                 }
                 let position = self.out.position().map(|p| (p, p));
-                self.loader.begin_stream(Checker::new(Choice::Both, position).strict());
+                let checker = Checker::new(Choice::Both, position).strict();
+                self.loader.begin_stream(checker, self.out.homed());
                 self.state = State::Armed;
                 Ok(())
             }
@@ -675,23 +681,14 @@ impl Controller {
 
     /// An axis that the program moves before it has been homed. Streams are looked at as they come.
     fn not_homed(&self) -> Option<u8> {
-        if (0u8..).zip(&self.board.axes).all(|(axis, _)| self.out.is_homed(axis)) {
+        if self.loader.stream().is_some()
+            || (0u8..).zip(&self.board.axes).all(|(axis, _)| self.out.is_homed(axis))
+        {
             return None;
         }
         let mut homed = self.out.homed();
-        for (_, instruction) in decode(self.loader.program()) {
-            match instruction {
-                Ok(Instruction::Home { axis }) => homed |= crate::outputs::axis_bit(axis),
-                Ok(
-                    Instruction::Move { axis, .. }
-                    | Instruction::Go { axis, .. }
-                    | Instruction::Capture { axis, .. }
-                    | Instruction::Join { axis, .. },
-                ) if homed & crate::outputs::axis_bit(axis) == 0 => return Some(axis),
-                _ => {}
-            }
-        }
-        None
+        let mut program = decode(self.loader.program());
+        program.find_map(|(_, instruction)| unhomed(&mut homed, &instruction.ok()?))
     }
 
     fn stop(&mut self) -> Result<(), Refusal> {

@@ -4,7 +4,7 @@ use crate::board::Board;
 use crate::stream::{Source, Stream};
 use crate::verifier::{self, Checker};
 use daic_protocol::limits::{CHUNK_LEN, MAX_PROGRAM_BYTES, STREAM_BYTES};
-use daic_protocol::message::{Refusal, StreamState};
+use daic_protocol::message::Refusal;
 use daic_protocol::program::{self, ProgramBytes};
 
 /// One bit per chunk received.
@@ -72,12 +72,12 @@ impl Loader {
     }
 
     /// Begins a stream; drops what was staged.
-    pub(crate) fn begin_stream(&mut self, checker: Checker) {
+    pub(crate) fn begin_stream(&mut self, checker: Checker, homed: u8) {
         self.staging = None;
         self.staged.clear();
         // It is as long as its capacity.
         let _ = self.staged.resize(STREAM_BYTES, 0);
-        self.stream = Some(Stream::new(checker));
+        self.stream = Some(Stream::new(checker, homed));
     }
 
     /// Forgets the stream.
@@ -100,10 +100,6 @@ impl Loader {
 
     pub(crate) fn close_stream(&mut self, length: u32, hash: u32) -> Result<(), Refusal> {
         self.stream.as_mut().ok_or(Refusal::NotStreaming)?.end(length, hash)
-    }
-
-    pub(crate) fn stream_state(&self, played: u64) -> Result<StreamState, Refusal> {
-        self.stream.as_ref().map(|s| s.state(played)).ok_or(Refusal::NotStreaming)
     }
 
     /// Takes a program from elsewhere, verified as at commit; what was staged is dropped.

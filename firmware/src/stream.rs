@@ -1,6 +1,7 @@
 //! Where a program comes from: memory, or the host while it is played.
 
 use crate::board::Board;
+use crate::player::unhomed;
 use crate::verifier::{Checker, violation};
 use daic_protocol::limits::STREAM_BYTES;
 use daic_protocol::message::{Refusal, Rule, StreamState, Violation};
@@ -75,6 +76,8 @@ pub(crate) struct Stream {
     sealed: bool,
     hasher: Hasher,
     checker: Checker,
+    /// Axes that know where they are once what was checked has been played.
+    homed: u8,
     min_lead: u64,
 }
 
@@ -89,7 +92,7 @@ fn place(offset: u32) -> usize {
 }
 
 impl Stream {
-    pub(crate) fn new(checker: Checker) -> Self {
+    pub(crate) fn new(checker: Checker, homed: u8) -> Self {
         Self {
             received: 0,
             checked: 0,
@@ -100,6 +103,7 @@ impl Stream {
             sealed: false,
             hasher: Hasher::new(),
             checker,
+            homed,
             min_lead: u64::MAX,
         }
     }
@@ -186,6 +190,7 @@ impl Stream {
         }
         let (mut checker, mut checked, mut instructions) =
             (self.checker.clone(), self.checked, self.instructions);
+        let mut homed = self.homed;
         while checked < end {
             let bytes = gather(ring, checked, end);
             let index = u16::try_from(instructions).unwrap_or(u16::MAX);
@@ -196,6 +201,9 @@ impl Stream {
                 break;
             };
             checker.take(index, &instruction, board).map_err(Refusal::Invalid)?;
+            if let Some(axis) = unhomed(&mut homed, &instruction) {
+                return Err(Refusal::NotHomed { axis });
+            }
             checked = checked.saturating_add(u32::try_from(length).unwrap_or(0));
             instructions = instructions.saturating_add(1);
         }
@@ -204,6 +212,7 @@ impl Stream {
             self.min_lead = self.min_lead.min(self.lead(played));
         }
         (self.checker, self.checked, self.instructions) = (checker, checked, instructions);
+        self.homed = homed;
         self.received = end;
         self.hasher.update(fresh);
         Ok(())

@@ -6,8 +6,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use daic_firmware::{AxisLimits, Board, Controller, Homing, LedLimits, Overdrive, Sink};
-use daic_protocol::channels::{AXES, LEDS, SAFE_WORD};
-use daic_protocol::limits::{EVENT_RING, EVENTS_PER_REPLY, MAX_SLOTS, TICK_HZ};
+use daic_protocol::channels::{self, AXES, LEDS, SAFE_WORD};
+use daic_protocol::limits::{EVENT_RING, EVENTS_PER_REPLY, MAX_SLOTS, STREAM_BYTES, TICK_HZ};
 use daic_protocol::message::{Autostart, Capabilities, SlotError, SlotInfo, State};
 use daic_protocol::program::ProgramBytes;
 
@@ -24,7 +24,9 @@ pub const STEPPED_PATIENCE_S: f64 = 60.0;
 /// Unread events of a run at which stepped time stands still until a host reads: what is left of the
 /// ring takes what one tick brings, and keeps the last replies' events for a host that asks again.
 const UNREAD_MAX: u32 = (EVENT_RING - 4 * EVENTS_PER_REPLY) as u32;
-/// Without a host that reads, stepped time stands still no longer than this (by the wall clock).
+/// Bytes of a stream below which stepped time stands still until more come.
+const STREAM_LOW: u32 = STREAM_BYTES as u32 / 2;
+/// Without a host that reads or sends, stepped time stands still no longer than this (by the wall clock).
 const UNREAD_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Longest sleep of the loop, which bounds the delay of a stop.
@@ -151,15 +153,19 @@ pub(crate) struct BoardThread {
     boots: u32,
     answered: u32,
     reading: Reading,
+    /// Trigger inputs as they were last seen.
+    inputs: u32,
 }
 
-/// Whether the host keeps up with reading events.
+/// Whether the host keeps up with reading events and sending a stream.
 #[derive(Debug, Default)]
 struct Reading {
     /// Sequence number of the run's first event.
     first: u32,
     /// Where reading stood when last looked at.
     read: u32,
+    /// Bytes of a stream that had come when last looked at.
+    received: Option<u32>,
     /// Since when stepped time stands still.
     held: Option<Instant>,
     /// Patience has run out, and nothing has been read since.
@@ -167,14 +173,14 @@ struct Reading {
 }
 
 impl Reading {
-    /// Whether playing on may overwrite what a host has yet to read.
-    fn behind(&mut self, next: u32, read: u32) -> bool {
-        if read != self.read {
-            *self = Self { first: self.first, read, ..Self::default() };
+    /// Whether playing on may overwrite what a host has yet to read, or play what it has yet to send.
+    fn behind(&mut self, next: u32, read: u32, received: Option<u32>, dry: bool) -> bool {
+        if (read, received) != (self.read, self.received) {
+            *self = Self { first: self.first, read, received, ..Self::default() };
         }
         // Sequence numbers wrap; what came before the run does not count.
         let unread = next.wrapping_sub(self.first).min(next.wrapping_sub(read));
-        if self.given_up || unread < UNREAD_MAX {
+        if self.given_up || (unread < UNREAD_MAX && !dry) {
             self.held = None;
             return false;
         }
@@ -204,6 +210,7 @@ impl BoardThread {
             boots: 1,
             answered: 0,
             reading: Reading::default(),
+            inputs: 0,
         }
     }
 
@@ -299,8 +306,13 @@ impl BoardThread {
         self.play_until(end);
     }
 
+    /// Stepped time is the host's: it stands still while a host has yet to read events that would be
+    /// overwritten, or to send more of a stream that would run dry.
     fn held(&mut self) -> bool {
-        self.reading.behind(self.controller.next_event(), self.controller.events_read())
+        let stream = self.controller.stream().filter(|stream| !stream.ended);
+        let received = stream.map(|stream| stream.received);
+        let dry = stream.is_some_and(|s| s.received.saturating_sub(s.consumed) < STREAM_LOW);
+        self.reading.behind(self.controller.next_event(), self.controller.events_read(), received, dry)
     }
 
     fn run_wall(&mut self, rate: f64) {
@@ -335,38 +347,56 @@ impl BoardThread {
     /// controller, or an input that it may be waiting for.
     fn due(&self) -> Option<u64> {
         let output = self.controller.next_due().map(|tick| self.boot_tick.saturating_add(tick));
-        let input = self.wiring.due(&self.world).filter(|_| self.controller.state() == State::Running);
+        let awaited = self.controller.state() == State::Running || self.slots.await_input();
+        let input = self.wiring.due(&self.world).filter(|_| awaited);
         output.into_iter().chain(input).min()
     }
 
     fn play_until(&mut self, tick: u64) {
         loop {
             let next = self.due().map_or(tick, |due| due.min(tick));
-            let mut wires = Wires {
-                world: &mut self.world,
-                record: lock(&self.shared.record),
-                slots: &mut self.slots,
-                boot_tick: self.boot_tick,
-            };
             let here = next.saturating_sub(self.boot_tick);
-            self.controller.play(here, &mut wires);
-            drop(wires);
             // Only inputs that something is wired to need the world to keep up.
             if self.wiring.is_wired() {
+                // An input that changes now may be what is waited for up to now.
+                let known = here.saturating_sub(1);
+                self.with_controller(|controller, wires| controller.play_ahead(here, known, wires));
                 self.world.advance(next);
                 let word = self.wiring.word(next, &self.world);
-                let mut wires = Wires {
-                    world: &mut self.world,
-                    record: lock(&self.shared.record),
-                    slots: &mut self.slots,
-                    boot_tick: self.boot_tick,
-                };
-                self.controller.inputs(here, word, &mut wires);
+                self.with_controller(|controller, wires| controller.inputs(here, word, wires));
+                let risen = word & !std::mem::replace(&mut self.inputs, word);
+                self.autostart(here, |autostart| match autostart {
+                    Autostart::Input { input } => {
+                        channels::trigger_input(input).is_some_and(|bit| risen & bit != 0)
+                    }
+                    _ => false,
+                });
             }
+            self.with_controller(|controller, wires| controller.play(here, wires));
             if next >= tick {
                 return;
             }
         }
+    }
+
+    /// Starts the first slot that starts by itself `when` this is the case; a box that refuses stays as it is.
+    fn autostart(&mut self, here: u64, when: impl Fn(Autostart) -> bool) {
+        if matches!(self.controller.state(), State::Running | State::Faulted) {
+            return;
+        }
+        if let Some(slot) = self.slots.list().into_iter().find(|slot| when(slot.autostart)) {
+            self.with_controller(|controller, wires| controller.autostart(here, slot.slot, wires)).ok();
+        }
+    }
+
+    fn with_controller<T>(&mut self, act: impl FnOnce(&mut Controller, &mut Wires<'_>) -> T) -> T {
+        let mut wires = Wires {
+            world: &mut self.world,
+            record: lock(&self.shared.record),
+            slots: &mut self.slots,
+            boot_tick: self.boot_tick,
+        };
+        act(&mut self.controller, &mut wires)
     }
 
     /// Gives bytes to the controller and returns what it answers.
@@ -433,6 +463,7 @@ impl BoardThread {
             self.world.level(self.now, led, 0);
         }
         lock(&self.shared.record).word(self.now, SAFE_WORD);
+        self.autostart(0, |autostart| autostart == Autostart::PowerUp);
     }
 
     fn publish(&mut self) {

@@ -14,6 +14,11 @@ impl Slots {
         Self(vec![None; usize::from(count).min(MAX_SLOTS)])
     }
 
+    /// Whether one of them starts by a trigger input.
+    pub(crate) fn await_input(&self) -> bool {
+        self.0.iter().flatten().any(|(_, autostart)| matches!(autostart, Autostart::Input { .. }))
+    }
+
     fn place(&mut self, slot: u8) -> Result<&mut Option<(Vec<u8>, Autostart)>, SlotError> {
         let none = if self.0.is_empty() { SlotError::NoMemory } else { SlotError::NoSuchSlot };
         self.0.get_mut(usize::from(slot)).ok_or(none)

@@ -553,6 +553,55 @@ pub enum Error {
         /// How many points failed for which reason.
         reasons: String,
     },
+    /// An axis that the experiment does not describe.
+    #[error("the experiment has no axis {axis}; describe it under [rig.axes.{axis}]")]
+    StageAxis {
+        /// Name.
+        axis: &'static str,
+    },
+    /// Travel beyond the limits of the axis, or none.
+    #[error(
+        "calibrating axis {axis} needs the travel from {:.4} to {:.4} mm, [rig.axes.{axis}] allows {} to {} mm; choose another --travel or --centre",
+        needs_mm[0], needs_mm[1], limits_mm[0], limits_mm[1]
+    )]
+    StageTravel {
+        /// Name.
+        axis: &'static str,
+        /// Lowest and highest position.
+        needs_mm: [f64; 2],
+        /// Limits of the experiment.
+        limits_mm: [f64; 2],
+    },
+    /// The legs did not begin far enough beyond their first position.
+    #[error(
+        "the backlash of {backlash_um:.1} µm is more than the {beyond_um:.1} µm that the legs begin beyond their positions; choose a longer --travel"
+    )]
+    StageTravelTooShort {
+        /// Backlash found, perhaps too small.
+        backlash_um: f64,
+        /// Way before the first position of a leg.
+        beyond_um: f64,
+    },
+    /// Too few frames to tell scale, play and their scatter.
+    #[error(
+        "only {frames} frames of the stage could be measured, {least} are wanted, counting up and counting down"
+    )]
+    StageFrames {
+        /// Frames measured.
+        frames: usize,
+        /// Frames wanted.
+        least: usize,
+    },
+    /// The box saw nothing of the camera.
+    #[error(
+        "no exposure was seen after {triggers} triggers of camera line {line}: is the camera's exposure-active output wired to the box, and does the camera wait for triggers?"
+    )]
+    NoExposures {
+        /// Camera line.
+        line: u8,
+        /// Triggers given.
+        triggers: u32,
+    },
     /// No folder of frames.
     #[error(
         "where do frames come from? Give --frames FOLDER, or `source = {{ folder = \"…\" }}` in [rig.camera]; `daic simulate` is for the simulated rig"

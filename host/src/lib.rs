@@ -33,6 +33,7 @@ pub mod distortion_file;
 pub mod doctor;
 pub mod error;
 pub mod expand;
+pub mod exposure;
 mod figures;
 pub mod folder_camera;
 pub mod frames;
@@ -55,6 +56,7 @@ pub mod sequence;
 pub mod settings;
 #[cfg(feature = "sim")]
 pub mod simulated;
+pub mod stage;
 pub mod strain;
 pub mod timeline;
 pub mod usage;

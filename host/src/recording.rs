@@ -1,6 +1,7 @@
 //! A run of the rig into a dataset, written as it comes in.
 
 use crate::error::Error;
+use crate::exposure::{Exposures, Stated};
 use crate::folder_camera::FolderCamera;
 use crate::process::{FrameCounts, PROGRAM, START_STEPS};
 use crate::progress::Progress;
@@ -180,7 +181,9 @@ fn judge(
     let arrived = records.len();
     let triggers: Vec<_> = run.triggers.iter().map(|t| t.trigger).collect();
     let plan = verdicts::planned(&compiled.plan);
-    verdicts::apply(&mut records, &run.pairing, &triggers, &plan, exposure_ns(experiment));
+    let stated = Stated::of(experiment, compiled.plan.tick_hz);
+    let exposures = Exposures::of(&recording.dataset().events()?.records, stated.line);
+    verdicts::apply(&mut records, &run.pairing, &triggers, &plan, (&exposures, &stated));
     for (k, record) in records.into_iter().enumerate() {
         if k < arrived {
             recording.revise_frame(&record)?;
@@ -189,11 +192,6 @@ fn judge(
         }
     }
     Ok(())
-}
-
-/// Exposure of every frame.
-pub fn exposure_ns(experiment: &Experiment) -> u64 {
-    experiment.rig.camera.exposure.ns().round() as u64
 }
 
 /// Columns and rows of every frame.

@@ -188,14 +188,31 @@ pub fn svg(traces: &[(&str, &str, &Words)], spans: &[(u64, u64)]) -> String {
         }
     }
     let foot = height - 10.0;
-    for tenth in 0..=10u64 {
-        let tick = (u128::from(end) * u128::from(tenth) / 10) as u64;
-        let ms = tick as f64 * 1e3 / f64::from(TICK_HZ);
-        writeln!(out, "<text x=\"{:.1}\" y=\"{foot}\" text-anchor=\"middle\">{ms:.3} ms</text>", x(tick))
-            .ok();
+    let (step, unit, per_tick) = graduation(end);
+    let mut value = 0.0;
+    while value <= end as f64 * per_tick {
+        let (at, digits) = (x((value / per_tick).round() as u64), usize::from(step < 1.0));
+        let label = format!("{value:.digits$} {unit}");
+        writeln!(out, "<text x=\"{at:.1}\" y=\"{foot}\" text-anchor=\"middle\">{label}</text>").ok();
+        value += step;
     }
     out.push_str("</svg>\n");
     out
+}
+
+/// Graduation of a time axis of so many ticks: distance of the marks, its unit, units per tick.
+fn graduation(end: u64) -> (f64, &'static str, f64) {
+    let seconds = end as f64 / f64::from(TICK_HZ);
+    let (unit, per_s) = match seconds {
+        s if s >= 2.0 => ("s", 1.0),
+        s if s >= 2e-3 => ("ms", 1e3),
+        s if s >= 2e-6 => ("µs", 1e6),
+        _ => ("ns", 1e9),
+    };
+    let least = (seconds * per_s / 10.0).max(1e-9);
+    let power = 10f64.powf(least.log10().floor());
+    let step = [1.0, 2.0, 5.0, 10.0].into_iter().map(|m| m * power).find(|s| *s >= least);
+    (step.unwrap_or(least), unit, per_s / f64::from(TICK_HZ))
 }
 
 /// A page with the diagram, its legend and the difference.
@@ -241,6 +258,18 @@ pub fn played(events: &[daic_protocol::message::Event], begin: u64) -> Vec<(u64,
     crate::expand::changes(&words.collect::<Vec<_>>())
 }
 
+/// How the waits of a run ended, in order; ticks counted from `begin`.
+pub fn answers(events: &[daic_protocol::message::Event], begin: u64) -> Vec<crate::expand::Answer> {
+    use crate::expand::Answer;
+    use daic_protocol::message::EventKind;
+    let answer = |event: &daic_protocol::message::Event| match event.kind {
+        EventKind::Triggered { .. } => Some(Answer::Triggered(event.tick.saturating_sub(begin))),
+        EventKind::TimedOut { .. } => Some(Answer::TimedOut),
+        _ => None,
+    };
+    events.iter().filter_map(answer).collect()
+}
+
 /// The same lines of a plan.
 pub fn without_axes(words: &Words) -> Vec<(u64, u32)> {
     let words: Vec<_> = words.iter().map(|&(tick, word)| (tick, word & !channels::AXIS_MASK)).collect();
@@ -271,6 +300,21 @@ mod tests {
         let expected = "$timescale 1 ns $end\n$scope module planned $end\n$var wire 1 ! led0 $end\n\
             $var wire 1 \" camera0 $end\n$upscope $end\n$enddefinitions $end\n#0\n0!\n0\"\n#80\n1!\n#160\n0!\n1\"\n#240\n0\"\n";
         assert_eq!(text, expected);
+    }
+
+    #[test]
+    fn time_is_graduated_in_round_numbers() {
+        for (end, step, unit) in [
+            (7_537_414, 10.0, "ms"),
+            (625_000_000, 0.5, "s"),
+            (62_500_000, 50.0, "ms"),
+            (1250, 1.0, "µs"),
+            (100, 100.0, "ns"),
+        ] {
+            let (found, name, _) = graduation(end);
+            assert!((found - step).abs() < 1e-9 && name == unit, "{end}: {found} {name}");
+        }
+        assert!(svg(&[("planned", "#06c", &[(10, 1), (7_537_414, 0)])], &[]).contains(">60 ms<"));
     }
 
     #[test]

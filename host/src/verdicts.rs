@@ -3,6 +3,7 @@
 //! Used when a run ends, and again when a dataset is processed whose recording was interrupted before that.
 
 use crate::error::Error;
+use crate::exposure::{Exposures, Stated};
 use daic_dataset::{EventRecord, FrameRecord, FrameRole, StrobeRecord, Verdict};
 use daic_protocol::message::{Event, EventKind};
 use daic_rig::acquire::triggers_of;
@@ -53,14 +54,15 @@ pub fn apply(
     pairing: &Pairing,
     triggers: &[Trigger],
     plan: &[PlannedRecord],
-    exposure_ns: u64,
+    exposure: (&Exposures, &Stated),
 ) {
     for (record, verdict) in records.iter_mut().zip(&pairing.frames) {
         match *verdict {
             pairing::Verdict::Paired { trigger, .. } => {
                 record.verdict = Verdict::Paired;
-                record.exposure_ns = Some(exposure_ns);
+                record.exposure_ns = Some(exposure.1.length_ns.round() as u64);
                 name(record, triggers.get(trigger), plan.get(trigger));
+                exposure.0.note(record, exposure.1);
             }
             pairing::Verdict::Extra => record.verdict = Verdict::Extra,
             pairing::Verdict::Ambiguous => record.verdict = Verdict::Ambiguous,
@@ -102,8 +104,7 @@ pub fn from_events(
     events: &[EventRecord],
     plan: &serde_json::Value,
     camera_mask: u32,
-    tick_hz: u32,
-    exposure_ns: u64,
+    stated: &Stated,
 ) -> Result<(), Error> {
     let plan: Vec<PlannedRecord> =
         serde_json::from_value(plan.clone()).map_err(|source| Error::Plan { reason: source.to_string() })?;
@@ -118,8 +119,9 @@ pub fn from_events(
             host_ns: None,
         })
         .collect();
-    let pairing = pairing::pair(&triggers, &stamps, &PairingOptions::new(tick_hz), None);
-    apply(records, &pairing, &triggers, &plan, exposure_ns);
+    let pairing = pairing::pair(&triggers, &stamps, &PairingOptions::new(stated.tick_hz), None);
+    let exposures = Exposures::of(events, stated.line);
+    apply(records, &pairing, &triggers, &plan, (&exposures, stated));
     Ok(())
 }
 

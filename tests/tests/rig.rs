@@ -206,3 +206,64 @@ fn an_interrupted_recording_can_be_measured() {
     }
     assert_eq!(summary["damage"].as_array().expect("a list").len(), 1, "the torn line is told");
 }
+
+#[test]
+fn trigger_to_exposure_is_measured_and_corrected() {
+    let folder = TempDir::new().expect("folder");
+    experiment(folder.path());
+    // 340 µs from trigger to exposure, of which the experiment knows nothing
+    let scene = SCENE.replace("trigger_delay_ns = 0", "trigger_delay_ns = 340000")
+        + "[board]\nexposure_active = true\nleds = [{}, {}]\naxes = [{}, {}, {}]\n";
+    std::fs::write(folder.path().join("scene.toml"), scene).expect("written");
+    let sim = Box::start(folder.path(), &["--pty", "--scene", "scene.toml"]);
+    let arguments = ["rig", "calibrate-exposure", "experiment.toml", "--triggers", "20", "--json", "--port"];
+    let found = daic(folder.path(), arguments.into_iter().chain([sim.port.as_str()])).expect_code(0).json();
+    drop(sim);
+    let number = |value: &serde_json::Value| value.as_f64().unwrap_or_else(|| panic!("{found}"));
+    assert_eq!(number(&found["exposures"]), 20.0);
+    assert!((number(&found["delay_us"]["mean"]) - 340.0).abs() < 0.0081, "{found}");
+    assert!((number(&found["length_us"]["mean"]) - 5000.0).abs() < 0.0081, "{found}");
+    assert_eq!(number(&found["stated_delay_us"]), 0.0);
+    // a run notes when each frame was exposed, and says that a strobe came too early for its exposure
+    let path = folder.path().join("experiment.toml");
+    let text =
+        std::fs::read_to_string(&path).expect("written").replace("delay = \"1 ms\"", "delay = \"0.2 ms\"");
+    std::fs::write(&path, text).expect("written");
+    let sim = Box::start(folder.path(), &["--pty", "--scene", "scene.toml", "--frames", "camera"]);
+    let arguments =
+        ["run", "experiment.toml", "--quiet", "--port", &sim.port, "--frames", "camera", "--out", "data"];
+    daic(folder.path(), arguments).expect_code(0);
+    let frames =
+        Dataset::open(&folder.path().join("data")).expect("dataset").frames().expect("frames").records;
+    let paired: Vec<_> = frames.iter().filter(|f| f.verdict == Verdict::Paired).collect();
+    assert_eq!(paired.len(), 7);
+    for frame in paired {
+        let delay = frame.exposure_tick.zip(frame.trigger_tick).map(|(e, t)| e - t);
+        // 340 µs are 42 500 ticks
+        assert_eq!(delay, Some(42_500), "{frame:?}");
+        assert!(frame.note.contains("340.000 to 5340.000 µs"), "{}", frame.note);
+    }
+}
+
+#[test]
+fn loops_are_streamed_as_if_they_were_stored() {
+    let folder = TempDir::new().expect("folder");
+    let program = r#"[
+        {"LoopBegin": {"count": 2000}},
+        {"Edge": {"mask": 4096, "value": 4096, "after": 30000}},
+        {"LoopBegin": {"count": 2}},
+        {"Edge": {"mask": 8192, "value": 8192, "after": 10000}},
+        {"Edge": {"mask": 8192, "value": 0, "after": 1000}},
+        "LoopEnd",
+        {"Edge": {"mask": 4096, "value": 0, "after": 500}},
+        "LoopEnd"
+    ]"#;
+    std::fs::write(folder.path().join("program.json"), program).expect("written");
+    let sim = Box::start(folder.path(), &["--pty"]);
+    let stream = ["rig", "stream", "program.json", "--json", "--port", &sim.port];
+    let answer = daic(folder.path(), stream).expect_code(0).json();
+    assert_eq!(answer["instructions"], 12_000);
+    // begin, 12 000 edges, the smallest lead, end
+    assert_eq!(answer["events"], 12_003, "{answer}");
+    assert!(answer["min_lead_ms"].as_f64().is_some_and(|lead| lead > 0.0), "{answer}");
+}

@@ -22,7 +22,7 @@ cargo xtask COMMAND
              controller, on the simulated board, on the emulated Pico, on the board at PORT
              --serve: the emulated Pico on TCP, for `daic rig` and the like
              --faults N: N more runs of the fault campaign; totals in docs/campaigns/faults.json
-             --verifier [--long]: 10 000 (1 000 000) random programs through the verifier
+             --verifier [--long]: 10 000 (1 000 000 more) random programs through the verifier
   lint       formatting, clippy, documentation without warnings, cargo-deny where installed
   ci         test, then lint
   datasheet  measures on the emulated Pico and writes the numbers into docs/datasheet.md
@@ -30,6 +30,7 @@ cargo xtask COMMAND
   coverage   2 000 simulated calibrations: what the stated uncertainties cover (minutes)
   reproduce  macro: chapter 2 of the thesis, micro: chapter 3, simulated and measured, into
              docs/reproduction.md
+  fuzz       [--long]: each fuzz target for a minute (an hour); needs a nightly compiler and cargo-fuzz
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders
              guard [--update]: instruction counts against the baseline (or: makes a new one)
@@ -58,10 +59,12 @@ fn main() -> ExitCode {
         ["hil", "--faults", count] if count.parse::<u64>().is_ok() => {
             campaign::faults(count.parse().unwrap_or(0))
         }
-        ["hil", "--verifier"] => campaign::verifier(10_000),
-        ["hil", "--verifier", "--long"] => campaign::verifier(1_000_000),
+        ["hil", "--verifier"] => campaign::verifier(),
+        ["hil", "--verifier", "--long"] => campaign::verifier_long(100),
         ["hil", "--serve"] => hil::serve(),
         ["hil", ..] => hil::hil(&words[1..]),
+        ["fuzz"] => campaign::fuzz(60),
+        ["fuzz", "--long"] => campaign::fuzz(3600),
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),
         ["bench", "optics"] => steps::bench_optics(),

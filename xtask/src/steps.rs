@@ -208,6 +208,13 @@ pub fn figures() -> Report {
             Err(error) => Outcome::Failed(error.to_string()),
         }
     });
+    report.step("a program of the trigger box into docs/figures", || {
+        let mut command =
+            cargo(&["run", "--release", "--locked", "--package", "daic", "--", "rig", "timeline"]);
+        command.arg(root().join("examples/strobe.json")).arg("--out");
+        command.arg(root().join("docs/figures/strobe.svg"));
+        outcome_of(command)
+    });
     report.step("a distortion map into docs/figures", || {
         let folder = root().join("target/figures-target");
         match distortion_map(&folder, "2592x1944", Profile::Release) {

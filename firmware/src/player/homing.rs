@@ -3,10 +3,11 @@
 use crate::Sink;
 use crate::board::Homing;
 use crate::motion::{DIR_DELAY, DIR_SETUP, STEP_PULSE};
-use crate::outputs::Outputs;
+use crate::outputs::{Outputs, axis_bit};
 use daic_protocol::channels;
 use daic_protocol::limits::TICK_HZ;
 use daic_protocol::message::{EventKind, FaultCause};
+use daic_protocol::program::Instruction;
 
 /// What homing came to at some tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -124,5 +125,20 @@ impl Search {
             }
         }
         Some(Found::Searching)
+    }
+}
+
+/// The axis that an instruction moves although it does not know where it is; `homed` are the axes that do, a bit each.
+pub(crate) fn unhomed(homed: &mut u8, instruction: &Instruction) -> Option<u8> {
+    match *instruction {
+        Instruction::Home { axis } => {
+            *homed |= axis_bit(axis);
+            None
+        }
+        Instruction::Move { axis, .. }
+        | Instruction::Go { axis, .. }
+        | Instruction::Capture { axis, .. }
+        | Instruction::Join { axis, .. } => (*homed & axis_bit(axis) == 0).then_some(axis),
+        _ => None,
     }
 }

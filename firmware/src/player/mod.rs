@@ -9,7 +9,7 @@ mod motion;
 mod trigger;
 
 use homing::{Found, Search};
-pub(crate) use homing::{SHORTEST as SHORTEST_HOMING, longest as longest_homing};
+pub(crate) use homing::{SHORTEST as SHORTEST_HOMING, longest as longest_homing, unhomed};
 use motion::{Motion, Pace, Target};
 use trigger::{Gate, Wait, is_open};
 

@@ -370,11 +370,13 @@ impl Default for LightConfig {
 pub struct StageConfig {
     /// Steps per millimetre of axes 0, 1, 2.
     pub steps_per_mm: [f64; 3],
+    /// Play of the drives of axes 0, 1, 2: after a reversal a drive turns so far before the stage follows.
+    pub backlash_mm: [f64; 3],
 }
 
 impl Default for StageConfig {
     fn default() -> Self {
-        Self { steps_per_mm: [6400.0; 3] }
+        Self { steps_per_mm: [6400.0; 3], backlash_mm: [0.0; 3] }
     }
 }
 

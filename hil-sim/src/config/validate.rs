@@ -103,6 +103,9 @@ impl SimConfig {
         for &steps in &self.stage.steps_per_mm {
             positive("stage.steps_per_mm", steps)?;
         }
+        for &backlash in &self.stage.backlash_mm {
+            within("stage.backlash_mm", backlash, 0.0, 10.0)?;
+        }
         within(
             "board.axes (number)",
             self.board.axes.len() as f64,

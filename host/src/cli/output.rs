@@ -29,6 +29,12 @@ impl Answer {
         Self { json, text: text.into(), passed: true }
     }
 
+    /// Adds to the text for people.
+    pub fn with_note(mut self, note: &str) -> Self {
+        self.text.push_str(note);
+        self
+    }
+
     /// Marks the answer of a check: a check that did not hold exits with 1.
     pub fn checked(mut self, passed: bool) -> Self {
         self.passed = passed;

@@ -2,30 +2,36 @@
 
 use super::commands::as_json;
 use super::output::{Answer, Output};
-use clap::{Args, Subcommand};
+use clap::{Args, Subcommand, ValueEnum};
 use daic::box_program::{encode, read, read_instructions};
+use daic::expand::{self, Waits};
+use daic::exposure::{self, Exposures, Stated};
 use daic::recording::event_record;
-use daic::{Error, Progress as _, expand, timeline};
-use daic_dataset::atomic;
+use daic::{Error, Progress as _, stage, timeline};
+use daic_dataset::{Existing, atomic};
 use daic_protocol::limits::TICK_HZ;
 use daic_protocol::message::{Autostart, Event, EventKind, SelfTests, State};
 use daic_protocol::program::Instruction;
 use daic_rig::RigError;
-use daic_rig::link::{EventReader, Link, LinkOptions, StreamSender};
+use daic_rig::experiment::Experiment;
+use daic_rig::link::{EventReader, Link, LinkOptions, StreamSender, Unrolled};
+use daic_rig::units::Length;
 use serde_json::{Value, json};
 use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
+/// Where the box is unless something else is said.
+const DEFAULT_PORT: &str = "/dev/ttyACM0";
 /// Between two looks at the box.
 const POLL: Duration = Duration::from_millis(10);
 
 #[derive(Debug, Args)]
 pub struct RigArgs {
-    /// Serial port or tcp://HOST:PORT of the trigger box
-    #[arg(long, global = true, default_value = "/dev/ttyACM0")]
-    pub port: String,
+    /// Serial port or tcp://HOST:PORT of the trigger box [default: /dev/ttyACM0, or what the experiment says]
+    #[arg(long, global = true)]
+    pub port: Option<String>,
     /// Bits per second of a serial port
     #[arg(long, global = true, default_value_t = 115_200)]
     pub baud: u32,
@@ -35,6 +41,17 @@ pub struct RigArgs {
 
 #[derive(Debug, Subcommand)]
 pub enum RigCommand {
+    #[command(flatten)]
+    Box(BoxCommand),
+    /// Find steps per millimetre, direction and backlash of an axis from what the camera sees
+    CalibrateStage(StageArgs),
+    /// Measure delay and length of exposures on the camera's exposure-active line
+    CalibrateExposure(ExposureArgs),
+}
+
+/// What needs nothing but the box.
+#[derive(Debug, Subcommand)]
+pub enum BoxCommand {
     /// What the box is, its state, its inputs, its slots
     Info,
     /// Load a program (experiment .toml, instructions .json, or encoded)
@@ -101,50 +118,196 @@ pub enum RigCommand {
     },
 }
 
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum AxisArg {
+    X,
+    Y,
+    Z,
+}
+
+#[derive(Debug, Args)]
+pub struct StageArgs {
+    /// Experiment that describes rig and optics; its sequence is not played
+    pub experiment: PathBuf,
+    /// Axis to calibrate
+    #[arg(long)]
+    pub axis: AxisArg,
+    /// Folder for the dataset; the result is in results/stage.json
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Replace a dataset that is there
+    #[arg(long)]
+    pub replace: bool,
+    /// From the lowest to the highest position; a quarter of it is needed beyond either end
+    #[arg(long, default_value = "400 um")]
+    pub travel: Length,
+    /// Middle of the positions
+    #[arg(long, default_value = "0 mm", allow_hyphen_values = true)]
+    pub centre: Length,
+    /// Positions on the way
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(2..=1000))]
+    pub positions: u32,
+    /// How often up and down
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=100))]
+    pub passes: u32,
+    /// Optics that are known otherwise than from moves of this stage (default: the experiment's own)
+    #[arg(long, value_name = "FILE")]
+    pub optics: Option<PathBuf>,
+    /// Folder of the camera's frames (default: the experiment's)
+    #[arg(long, value_name = "DIR")]
+    pub frames: Option<PathBuf>,
+    /// Scene of the simulated rig, where the experiment's port is `sim`
+    #[arg(long, value_name = "FILE")]
+    pub scene: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct ExposureArgs {
+    /// Experiment that describes the camera; its sequence is not played
+    pub experiment: PathBuf,
+    /// Exposures to measure
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub triggers: u32,
+}
+
+fn calibrate_exposure(
+    arguments: &ExposureArgs,
+    port: Option<&String>,
+    output: &Output,
+) -> Result<Answer, Error> {
+    let experiment = Experiment::load(&arguments.experiment)?;
+    let port = port.unwrap_or(&experiment.rig.port);
+    let mut link = rig(Link::open(port, daic::recording::link_options(&experiment)))?;
+    let stated = Stated::of(&experiment, link.hello().tick_hz);
+    let program = exposure::program(&experiment, link.hello(), arguments.triggers).map_err(RigError::from)?;
+    rig(link.load(&encode(&program)?))?;
+    let events: Vec<_> = play_loaded(&mut link, output)?.iter().map(event_record).collect();
+    let found = Exposures::of(&events, stated.line).summary(&stated);
+    let found = found.ok_or(Error::NoExposures { line: stated.line, triggers: arguments.triggers })?;
+    let mut text = format!(
+        "{} exposures after {} triggers, {} missing, {} unasked\n",
+        found.exposures, arguments.triggers, found.missing, found.unasked
+    );
+    let times = [
+        ("delay", found.delay_us, found.stated_delay_us),
+        ("length", found.length_us, found.stated_length_us),
+    ];
+    for (name, times, stated) in times {
+        let Some(t) = times else { continue };
+        writeln!(
+            text,
+            "{name:<7} {:.3} µs, jitter {:.3} µs ({:.3} to {:.3}), the experiment says {stated:.3} µs",
+            t.mean, t.std, t.min, t.max
+        )
+        .ok();
+    }
+    if let Some(delay) = found.delay_us {
+        write!(text, "in the experiment, under [rig.camera]:\nexposure_delay = \"{:.3} us\"", delay.mean)
+            .ok();
+    }
+    let whole = found.missing == 0 && found.unasked == 0 && found.exposures == arguments.triggers as usize;
+    Ok(Answer::new(as_json(&found)?, text).checked(whole))
+}
+
+fn calibrate_stage(arguments: &StageArgs, port: Option<&String>, output: &Output) -> Result<Answer, Error> {
+    let experiment = Experiment::load(&arguments.experiment)?;
+    output.stop_on_interrupt();
+    let options = stage::Options {
+        axis: arguments.axis as usize,
+        travel: arguments.travel,
+        centre: arguments.centre,
+        positions: arguments.positions,
+        passes: arguments.passes,
+        optics: arguments.optics.clone(),
+        out: arguments.out.clone(),
+        existing: if arguments.replace { Existing::Replace } else { Existing::Refuse },
+        port: port.cloned(),
+        frames: arguments.frames.clone(),
+        scene: arguments.scene.clone(),
+    };
+    let found = stage::calibrate(&experiment, &options, output)?;
+    let mut text = String::new();
+    let calibration = found.steps_per_mm_sigma_cal.map_or(String::new(), |s| format!(" (optics ± {s:.3})"));
+    writeln!(
+        text,
+        "steps per mm    {:.3} ± {:.3}{calibration}, the experiment says {}",
+        found.steps_per_mm, found.steps_per_mm_sigma, found.steps_per_mm_before
+    )
+    .ok();
+    writeln!(text, "backlash        {:.3} ± {:.3} µm", found.backlash_um, found.backlash_sigma_um).ok();
+    let [x, y, h] = found.direction;
+    writeln!(text, "direction       ({x:.5}, {y:.5}, {h:.5}), {:.3}° off {}", found.angle_deg, found.axis)
+        .ok();
+    if let Some([up, down]) = found.repeatability_um {
+        writeln!(text, "repeatability   {up:.3} µm counting up, {down:.3} µm counting down").ok();
+    }
+    writeln!(text, "residual        {:.3} µm RMS over {} frames", found.rms_um, found.frames).ok();
+    let approach = as_json(&found.approach)?;
+    let backlash = found.backlash_um.max(0.0);
+    write!(
+        text,
+        "in the experiment:\n[rig.axes.{}]\nsteps_per_mm = {:.3}\nbacklash = \"{backlash:.3} um\"\napproach = {approach}",
+        found.axis, found.steps_per_mm
+    )
+    .ok();
+    Ok(Answer::new(as_json(&found)?, text))
+}
+
 fn rig<T>(result: Result<T, daic_rig::link::LinkError>) -> Result<T, Error> {
     Ok(result.map_err(RigError::from)?)
 }
 
 pub fn run(arguments: &RigArgs, output: &Output) -> Result<Answer, Error> {
-    if let RigCommand::Timeline { program, out, play: false } = &arguments.command
-        && program.extension().is_none_or(|e| e != "toml")
-    {
-        let planned = expand::expand(&read_instructions(program)?, [0; 6])?;
-        return draw(out, &planned, None);
-    }
-    let options = LinkOptions { baud: arguments.baud, ..LinkOptions::default() };
-    let mut link = rig(Link::open(&arguments.port, options))?;
     match &arguments.command {
-        RigCommand::Info => info(&mut link),
-        RigCommand::Load { program } => {
-            let hash = load(&mut link, program)?;
+        RigCommand::CalibrateStage(stage) => calibrate_stage(stage, arguments.port.as_ref(), output),
+        RigCommand::CalibrateExposure(exposure) => {
+            calibrate_exposure(exposure, arguments.port.as_ref(), output)
+        }
+        RigCommand::Box(BoxCommand::Timeline { program, out, play: false })
+            if program.extension().is_none_or(|e| e != "toml") =>
+        {
+            draw_plan(out, &read_instructions(program)?, [0; 6])
+        }
+        RigCommand::Box(command) => {
+            let options = LinkOptions { baud: arguments.baud, ..LinkOptions::default() };
+            let port = arguments.port.as_deref().unwrap_or(DEFAULT_PORT);
+            with_box(command, &mut rig(Link::open(port, options))?, output)
+        }
+    }
+}
+
+fn with_box(command: &BoxCommand, link: &mut Link, output: &Output) -> Result<Answer, Error> {
+    match command {
+        BoxCommand::Info => info(link),
+        BoxCommand::Load { program } => {
+            let hash = load(link, program)?;
             Ok(Answer::new(json!({ "program": hash }), format!("loaded, hash {hash:#010x}")))
         }
-        RigCommand::Run { program } => {
+        BoxCommand::Run { program } => {
             if let Some(program) = program {
-                load(&mut link, program)?;
+                load(link, program)?;
             }
-            let events = play_loaded(&mut link, output)?;
+            let events = play_loaded(link, output)?;
             played_answer(&events)
         }
-        RigCommand::Stream { program } => stream(&mut link, program, output),
-        RigCommand::Watch => watch(&mut link, output),
-        RigCommand::Events { from } => {
+        BoxCommand::Stream { program } => stream(link, program, output),
+        BoxCommand::Watch => watch(link, output),
+        BoxCommand::Events { from } => {
             let mut events = Vec::new();
-            rig(EventReader::new(*from).poll(&mut link, &mut events))?;
+            rig(EventReader::new(*from).poll(link, &mut events))?;
             Ok(Answer::new(json!({ "events": records(&events)? }), lines(&events)))
         }
-        RigCommand::Home { axes } => {
+        BoxCommand::Home { axes } => {
             let program: Vec<_> = axes.iter().map(|&axis| Instruction::Home { axis }).collect();
-            play(&mut link, &program, output)
+            play(link, &program, output)
         }
-        RigCommand::Move { axis, target, rate, acceleration, jerk } => {
+        BoxCommand::Move { axis, target, rate, acceleration, jerk } => {
             let (axis, target) = (*axis, *target);
             let go =
                 Instruction::Move { axis, target, max_rate: *rate, acceleration: *acceleration, jerk: *jerk };
-            play(&mut link, &[go], output)
+            play(link, &[go], output)
         }
-        RigCommand::Store { slot, program, on_power_up, on_input, erase } => {
+        BoxCommand::Store { slot, program, on_power_up, on_input, erase } => {
             if *erase {
                 rig(link.erase(*slot))?;
                 return Ok(Answer::new(
@@ -153,7 +316,7 @@ pub fn run(arguments: &RigArgs, output: &Output) -> Result<Answer, Error> {
                 ));
             }
             if let Some(program) = program {
-                load(&mut link, program)?;
+                load(link, program)?;
             }
             let autostart = match (on_power_up, on_input) {
                 (true, _) => Autostart::PowerUp,
@@ -164,19 +327,20 @@ pub fn run(arguments: &RigArgs, output: &Output) -> Result<Answer, Error> {
             let slots = as_json(&rig(link.slots())?)?;
             Ok(Answer::new(json!({ "slots": slots }), format!("stored in slot {slot}")))
         }
-        RigCommand::Selftest => self_test(&mut link),
-        RigCommand::Timeline { program, out, play } => {
-            let instructions = read(program, &mut link)?;
+        BoxCommand::Selftest => self_test(link),
+        BoxCommand::Timeline { program, out, play } => {
+            let instructions = read(program, link)?;
             let position = rig(link.status())?.position;
-            let planned = expand::expand(&instructions, position)?;
             if !play {
-                return draw(out, &planned, None);
+                return draw_plan(out, &instructions, position);
             }
             rig(link.load(&encode(&instructions)?))?;
-            let events = play_loaded(&mut link, output)?;
+            let events = play_loaded(link, output)?;
             let begin =
                 events.iter().find(|e| matches!(e.kind, EventKind::RunStarted { .. })).map_or(0, |e| e.tick);
             let played = timeline::played(&events, begin);
+            let waits = timeline::answers(&events, begin);
+            let planned = expand::expand_with(&instructions, position, Waits::Ended(&waits))?;
             draw(out, &timeline::without_axes(&planned), Some(&played))
         }
     }
@@ -289,14 +453,15 @@ fn follow(
 
 fn stream(link: &mut Link, path: &std::path::Path, output: &Output) -> Result<Answer, Error> {
     let instructions = read(path, link)?;
-    let count = instructions.len();
+    // the box takes no loops in streams
+    let count = Unrolled::count(&instructions);
     let status = rig(link.status())?;
     if status.state == State::Faulted {
         rig(link.clear_fault())?;
     }
     output.stop_on_interrupt();
-    output.stage("streaming", count as u64);
-    let mut sender = rig(StreamSender::begin(link, instructions.into_iter()))?;
+    output.stage("streaming", count);
+    let mut sender = rig(StreamSender::begin(link, Unrolled::new(&instructions)))?;
     rig(link.start())?;
     let mut last = sender.state();
     let events = follow(link, status.next_event, output, &mut |link| {
@@ -358,6 +523,15 @@ fn self_test(link: &mut Link) -> Result<Answer, Error> {
         writeln!(text, "board test {}: {verdict}", bit - 16).ok();
     }
     Ok(Answer::new(as_json(&found)?, text).checked(found.failed == 0))
+}
+
+/// Draws a program that has not been played: what it waits for comes at once.
+fn draw_plan(out: &std::path::Path, program: &[Instruction], position: [i32; 6]) -> Result<Answer, Error> {
+    let planned = expand::expand_with(program, position, Waits::AtOnce)?;
+    let answer = draw(out, &planned, None)?;
+    let waits = program.iter().any(|i| matches!(i, Instruction::Wait { .. }));
+    let note = ", drawn as if every trigger came as soon as something waits for it";
+    Ok(if waits { answer.with_note(note) } else { answer })
 }
 
 fn draw(

@@ -15,6 +15,7 @@ pub use summary::{
 
 use crate::error::Error;
 use crate::expand;
+use crate::exposure::{ExposureSummary, Exposures, Stated};
 use crate::measure::{self, Displacement, Instrument, ObjectOptions, Profile, Reference, spread};
 use crate::optics_file::CalibratedOptics;
 use crate::optics_section;
@@ -139,6 +140,7 @@ pub fn process(
         sigma_um: last.map(|f| f.field.sigma_um),
         edge_error_ticks_max: edge_error,
         edges_compared,
+        exposure: exposure(&dataset, &experiment)?,
         calibration,
         profile: reference.profile,
         measured,
@@ -162,17 +164,17 @@ fn judged(dataset: &Dataset, experiment: &Experiment) -> Result<(Vec<FrameRecord
         let manifest = dataset.manifest();
         let mask = daic_protocol::channels::camera(experiment.rig.camera.line).unwrap_or(0);
         let tick_hz = manifest.tick_hz.map_or(daic_protocol::limits::TICK_HZ, |hz| hz as u32);
-        let exposure_ns = crate::recording::exposure_ns(experiment);
-        crate::verdicts::from_events(
-            &mut records,
-            &events.records,
-            &manifest.plan,
-            mask,
-            tick_hz,
-            exposure_ns,
-        )?;
+        let stated = Stated::of(experiment, tick_hz);
+        crate::verdicts::from_events(&mut records, &events.records, &manifest.plan, mask, &stated)?;
     }
     Ok((records, damage))
+}
+
+/// What the box saw of the exposures.
+fn exposure(dataset: &Dataset, experiment: &Experiment) -> Result<Option<ExposureSummary>, Error> {
+    let tick_hz = dataset.manifest().tick_hz.map_or(daic_protocol::limits::TICK_HZ, |hz| hz as u32);
+    let stated = Stated::of(experiment, tick_hz);
+    Ok(Exposures::of(&dataset.events()?.records, stated.line).summary(&stated))
 }
 
 fn failed(record: &FrameRecord, error: &Error) -> FailedFrame {
@@ -570,7 +572,7 @@ fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Option<T> {
     serde_json::from_slice(&std::fs::read(path).ok()?).ok()
 }
 
-fn write_json(path: &Path, value: &impl Serialize) -> Result<(), Error> {
+pub(crate) fn write_json(path: &Path, value: &impl Serialize) -> Result<(), Error> {
     if let Some(directory) = path.parent() {
         std::fs::create_dir_all(directory)
             .map_err(|source| Error::Folder { path: directory.to_owned(), source })?;

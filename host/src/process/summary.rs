@@ -1,5 +1,6 @@
 //! `summary.json`: what a dataset says, in numbers.
 
+use crate::exposure::ExposureSummary;
 use crate::measure::GapSummary;
 use serde::{Deserialize, Serialize};
 
@@ -27,6 +28,9 @@ pub struct Summary {
     pub edge_error_ticks_max: Option<u64>,
     /// Word changes that were compared.
     pub edges_compared: usize,
+    /// Exposures as the box saw them; none where no exposure-active line is wired.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub exposure: Option<ExposureSummary>,
     /// What the calibration found, if there was one.
     pub calibration: Option<CalibrationSummary>,
     /// Shape of the reference.

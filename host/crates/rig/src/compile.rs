@@ -53,6 +53,18 @@ pub enum CompileError {
         /// Target in millimetres.
         mm: f64,
     },
+    /// A move cannot go past its target before it arrives.
+    #[error(
+        "axis {axis} is to arrive at {mm} mm from the other side, by way of {by_way_mm} mm, which is beyond its travel; leave room for twice its backlash, or change its approach"
+    )]
+    NoRoomToApproach {
+        /// Axis.
+        axis: usize,
+        /// Target in millimetres.
+        mm: f64,
+        /// Where it has to turn, millimetres.
+        by_way_mm: f64,
+    },
     /// Two edges of one frame are closer than the box can play.
     #[error(
         "frame {frame:?} needs two edges {ticks} ticks apart, the box needs {min} ticks between them; lengthen trigger_width, strobe delay or strobe width"
@@ -160,7 +172,8 @@ pub struct PlannedStrobe {
 /// # Errors
 /// [`CompileError`]: the sequence asks for what this box does not have or cannot hold.
 pub fn compile(experiment: &Experiment, hello: &Hello, start: [i32; 6]) -> Result<Compiled, CompileError> {
-    let mut emitter = Emitter { experiment, hello, levels: [None; channels::LEDS as usize] };
+    let mut emitter =
+        Emitter { experiment, hello, levels: [None; channels::LEDS as usize], arrived: [None; AXES] };
     let nodes = emitter.steps(&experiment.sequence, 0)?;
 
     let mut instructions = Vec::new();
@@ -238,6 +251,8 @@ struct Emitter<'a> {
     hello: &'a Hello,
     /// Levels known at this point of the program.
     levels: [Option<u16>; channels::LEDS as usize],
+    /// Steps at which axes stand that have come there in their direction of approach, where that is known.
+    arrived: [Option<i32>; AXES],
 }
 
 impl<'a> Emitter<'a> {
@@ -252,7 +267,7 @@ impl<'a> Emitter<'a> {
                 Step::Move(m) => {
                     for (axis, target) in m.targets().into_iter().enumerate() {
                         if let Some(target) = target {
-                            nodes.push(self.travel(axis, target.mm())?);
+                            self.travel(axis, target.mm(), &mut nodes)?;
                         }
                     }
                 }
@@ -265,7 +280,11 @@ impl<'a> Emitter<'a> {
                     }
                     // The second pass begins with the levels that the first one left.
                     self.levels = [None; channels::LEDS as usize];
+                    let before = std::mem::take(&mut self.arrived);
                     let body = self.steps(&repeat.steps, depth + 1)?;
+                    for (now, before) in self.arrived.iter_mut().zip(before) {
+                        *now = now.or(before);
+                    }
                     nodes.push(Node::Loop { count: repeat.times, body });
                 }
             }
@@ -273,27 +292,51 @@ impl<'a> Emitter<'a> {
         Ok(nodes)
     }
 
-    fn travel(&self, axis: usize, mm: f64) -> Result<Node<'a>, CompileError> {
+    /// Moves an axis to `mm`; against its direction of approach, or from where it has come in an unknown one,
+    /// past the target and back.
+    fn travel(&mut self, axis: usize, mm: f64, nodes: &mut Vec<Node<'a>>) -> Result<(), CompileError> {
         let missing = CompileError::NoSuchAxis { axis, axes: self.hello.axes };
         let described = self.experiment.rig.axes.named().get(axis).and_then(|(_, a)| *a);
         let (Some(limits), Ok(number)) = (described, u8::try_from(axis)) else { return Err(missing) };
         if number >= self.hello.axes {
             return Err(missing);
         }
-        let steps = (mm * limits.steps_per_mm).round();
+        let per_mm = limits.steps_per_mm;
+        let steps = (mm * per_mm).round();
         if steps.is_nan() || steps.abs() > f64::from(i32::MAX) {
             return Err(CompileError::TargetTooFar { axis, mm });
         }
         // Float-to-integer casts saturate; the range was checked.
         let target = steps as i32;
-        let play = Instruction::Move {
-            axis: number,
-            target,
-            max_rate: (limits.rate.mm_per_s() * limits.steps_per_mm).round() as u32,
-            acceleration: (limits.acceleration.mm_per_s2() * limits.steps_per_mm).round() as u32,
-            jerk: 0,
+        let go = |to: i32| Node::Move {
+            play: Instruction::Move {
+                axis: number,
+                target: to,
+                max_rate: (limits.rate.mm_per_s() * per_mm).round() as u32,
+                acceleration: (limits.acceleration.mm_per_s2() * per_mm).round() as u32,
+                jerk: limits.jerk.map_or(0, |jerk| (jerk.mm_per_s3() * per_mm).round() as u32),
+            },
+            axis,
+            target: to,
+            mm,
         };
-        Ok(Node::Move { play, axis, target, mm })
+        if limits.backlash.mm() > 0.0 {
+            let sign = limits.approach.sign();
+            let with = self.arrived.get(axis).copied().flatten();
+            if with.is_none_or(|from| i64::from(sign) * (i64::from(target) - i64::from(from)) < 0) {
+                let past = steps - f64::from(sign) * (2.0 * limits.backlash.mm() * per_mm).ceil();
+                let by_way_mm = past / per_mm;
+                if by_way_mm < limits.min.mm() || by_way_mm > limits.max.mm() {
+                    return Err(CompileError::NoRoomToApproach { axis, mm, by_way_mm });
+                }
+                nodes.push(go(past as i32));
+            }
+            if let Some(arrived) = self.arrived.get_mut(axis) {
+                *arrived = Some(target);
+            }
+        }
+        nodes.push(go(target));
+        Ok(())
     }
 
     fn level(

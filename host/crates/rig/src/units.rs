@@ -3,7 +3,7 @@
 //! Each quantity is a newtype over one `f64` in one base unit, named by its accessor. A plain
 //! number, a unit of another quantity, NaN, and numbers beyond any rig (±1e12 in the base unit, times
 //! ±1e15 ns) are refused. `µ` (either code point) and
-//! `u` mean the same, `²` and `^2` too.
+//! `u` mean the same, `²` and `^2`, `³` and `^3` too.
 
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::Visitor;
@@ -157,7 +157,8 @@ impl Kind {
             .units
             .iter()
             .map(|u| {
-                let escaped = u.symbol.replace('/', "\\/").replace("^2", "(\\^2|²|2)");
+                let escaped =
+                    u.symbol.replace('/', "\\/").replace("^2", "(\\^2|²|2)").replace("^3", "(\\^3|³|3)");
                 match escaped.strip_prefix('u') {
                     Some(rest) => format!("[uµμ]{rest}"),
                     None => escaped.replace("/u", "/[uµμ]"),
@@ -172,7 +173,7 @@ impl Kind {
 fn normalise(symbol: &str) -> String {
     let mut s: String =
         symbol.chars().filter(|c| !c.is_whitespace()).collect::<String>().replace(['µ', 'μ'], "u");
-    s = s.replace('²', "^2").replace("s2", "s^2");
+    s = s.replace('²', "^2").replace("s2", "s^2").replace('³', "^3").replace("s3", "s^3");
     match s.strip_prefix("lines").or_else(|| s.strip_prefix("steps")) {
         Some(rest) if rest.starts_with('/') => rest.to_owned(),
         _ if s == "°" => "deg".to_owned(),
@@ -310,6 +311,11 @@ quantity!(
     Acceleration, mm_per_s2, "millimetres per second squared", "an acceleration", "50 mm/s^2", 1e12,
     [unit("mm/s^2", 1.0, 1.0), unit("um/s^2", 1.0, 1e3), unit("m/s^2", 1e3, 1.0)]
 );
+quantity!(
+    /// A jerk; base unit millimetre per second cubed.
+    Jerk, mm_per_s3, "millimetres per second cubed", "a jerk", "500 mm/s^3", 1e12,
+    [unit("mm/s^3", 1.0, 1.0), unit("um/s^3", 1.0, 1e3), unit("m/s^3", 1e3, 1.0)]
+);
 
 impl Time {
     /// The nearest whole number of ticks of a clock of `tick_hz` (saturating; negative gives 0).
@@ -352,6 +358,8 @@ mod tests {
         assert_eq!("300 lines/mm".parse::<PerLength>().map(PerLength::per_mm), Ok(300.0));
         assert_eq!("50 mm/s²".parse::<Acceleration>().map(Acceleration::mm_per_s2), Ok(50.0));
         assert_eq!("50 mm/s2".parse::<Acceleration>().map(Acceleration::mm_per_s2), Ok(50.0));
+        assert_eq!("0.5 m/s³".parse::<Jerk>().map(Jerk::mm_per_s3), Ok(500.0));
+        assert_eq!("500 mm/s3".parse::<Jerk>().map(Jerk::mm_per_s3), Ok(500.0));
     }
 
     #[test]

@@ -286,3 +286,88 @@ fn waits_beyond_one_instruction_are_split() {
     assert_eq!(settled, 120 * 125_000_000 + 250_000);
     assert_eq!(compiled.plan.frames[0].trigger_offset, Some(settled + 4));
 }
+
+/// Where a carriage stands that a drive with this much play pulls along.
+fn carriage(instructions: &[Instruction], play: i32, begin: i32) -> Vec<i32> {
+    let (mut carriage, mut seen) = (begin, Vec::new());
+    let mut loops: Vec<(usize, u32)> = Vec::new();
+    let mut at = 0;
+    while let Some(instruction) = instructions.get(at) {
+        match *instruction {
+            Instruction::Move { axis: 0, target, .. } => {
+                carriage = carriage.clamp(target - play, target);
+            }
+            Instruction::Edge { mask, value, .. } if mask & value & channels::CAMERA_MASK != 0 => {
+                seen.push(carriage);
+            }
+            Instruction::LoopBegin { count } => loops.push((at, count)),
+            Instruction::LoopEnd => {
+                let (begin, left) = loops.last_mut().expect("open");
+                *left -= 1;
+                if *left > 0 {
+                    at = *begin;
+                } else {
+                    loops.pop();
+                }
+            }
+            _ => {}
+        }
+        at += 1;
+    }
+    seen
+}
+
+#[test]
+fn play_of_the_drive_is_always_taken_up_in_the_same_direction() {
+    let sequence = "
+[[sequence]]
+move = { x = \"0.01 mm\" }
+[[sequence]]
+frame = { name = \"a\", role = \"series\" }
+[[sequence]]
+move = { x = \"-0.5 mm\" }
+[[sequence]]
+frame = { name = \"b\", role = \"series\" }
+[[sequence]]
+repeat = { times = 3, steps = [
+    { move = { x = \"0.1 mm\" } },
+    { frame = { name = \"c\", role = \"series\" } },
+    { move = { x = \"0.2 mm\" } },
+    { frame = { name = \"d\", role = \"series\" } },
+] }
+[[sequence]]
+move = { x = \"0.3 mm\" }
+[[sequence]]
+frame = { name = \"e\", role = \"series\" }
+";
+    for (approach, taken) in [("positive", 1), ("negative", 0)] {
+        let head = template().split("# --- what is played").next().expect("head").to_owned();
+        let text = head.replacen(
+            "acceleration = \"50 mm/s^2\"",
+            &format!(
+                "acceleration = \"50 mm/s^2\"\nbacklash = \"20 um\"\napproach = \"{approach}\"\njerk = \"500 mm/s^3\""
+            ),
+            1,
+        );
+        let compiled = compile_and_play(&parse(&format!("{text}{sequence}")));
+        let wanted: Vec<i32> = compiled.plan.frames.iter().map(|f| f.position_steps[0]).collect();
+        assert_eq!(wanted, [64, -3200, 640, 1280, 640, 1280, 640, 1280, 1920]);
+        // 20 µm are 128 steps; the carriage may have been left anywhere within its play
+        for begin in [-128, -64, 0] {
+            let seen = carriage(&compiled.instructions, 128, begin);
+            let behind: Vec<i32> = wanted.iter().zip(&seen).map(|(w, s)| (w - s) / 128).collect();
+            assert_eq!((behind, seen.len()), (vec![taken; 9], 9), "{approach} from {begin}: {seen:?}");
+        }
+        let jerks =
+            compiled.instructions.iter().filter(|i| matches!(i, Instruction::Move { jerk: 3_200_000, .. }));
+        assert!(jerks.count() > 6);
+    }
+    let head = template().split("# --- what is played").next().expect("head").to_owned();
+    let tight =
+        head.replacen("max = \"5 mm\"", "max = \"5 mm\"\nbacklash = \"20 um\"\napproach = \"negative\"", 1);
+    let sequence = "[[sequence]]\nmove = { x = \"4.99 mm\" }\n[[sequence]]\nframe = { name = \"f\", role = \"series\" }\n";
+    let experiment = parse(&format!("{tight}{sequence}"));
+    let hello = Bench::new().hello();
+    let found = compile(&experiment, &hello, [0; 6]);
+    assert_eq!(found.err(), Some(CompileError::NoRoomToApproach { axis: 0, mm: 4.99, by_way_mm: 5.03 }));
+}

@@ -4,11 +4,13 @@ mod common;
 
 use common::TestBox;
 use daic_protocol::frame::{Decoder, Fed, encode_reply};
-use daic_protocol::message::{Hello, Refusal, Reply, Request, Rule, SCHEMA_HASH, State};
+use daic_protocol::message::{Event, EventKind, Hello, Refusal, Reply, Request, Rule, SCHEMA_HASH, State};
 use daic_protocol::program::Instruction;
 use daic_rig::compile::encode;
 use daic_rig::link::{EventReader, Link, LinkError, LinkOptions, Outcome, StreamTransport, Transport, pipe};
 use std::io::{Read, Write};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::SeqCst;
 use std::time::Duration;
 
@@ -308,6 +310,127 @@ fn over_tcp_and_over_any_stream() {
     drop(rig);
     let error = link.status().expect_err("closed");
     assert!(matches!(error, LinkError::Disconnected { .. } | LinkError::Silent { .. }), "{error:?}");
+}
+
+/// The box's side of a line that is pulled out and plugged in again, many times.
+struct Loose<T, F> {
+    line: Option<T>,
+    /// Makes a new line, or not yet.
+    plug: F,
+    /// Set: pull it out.
+    pull: Arc<AtomicBool>,
+}
+
+impl<T: Transport, F: FnMut() -> Option<T> + Send> Transport for Loose<T, F> {
+    fn read(&mut self, buffer: &mut [u8], timeout: Duration) -> std::io::Result<usize> {
+        if self.pull.swap(false, SeqCst) {
+            self.line = None;
+        }
+        if self.line.is_none() {
+            self.line = (self.plug)();
+        }
+        let Some(line) = &mut self.line else {
+            std::thread::sleep(timeout);
+            return Ok(0);
+        };
+        Ok(line.read(buffer, timeout).unwrap_or_else(|_| {
+            self.line = None;
+            0
+        }))
+    }
+    fn write(&mut self, bytes: &[u8], timeout: Duration) -> std::io::Result<()> {
+        // what is written to a line that is not there is lost, and the box goes on
+        if self.line.as_mut().is_some_and(|line| line.write(bytes, timeout).is_err()) {
+            self.line = None;
+        }
+        Ok(())
+    }
+}
+
+/// Plays 400 events while the line is pulled out again and again; none is lost, nothing happens twice.
+fn survives(port: &str, line: Box<dyn Transport>, pull: &AtomicBool) {
+    let rig = TestBox::serve(line);
+    let mut link = Link::open(port, options()).expect("hello");
+    let program = encode(&[
+        Instruction::LoopBegin { count: 100 },
+        Instruction::Edge { mask: 1, value: 1, after: 625_000 },
+        Instruction::Edge { mask: 1, value: 0, after: 1000 },
+        Instruction::LoopEnd,
+    ]);
+    pull.store(true, SeqCst);
+    let hash = link.load(&program).expect("load");
+    pull.store(true, SeqCst);
+    link.arm(hash).expect("arm");
+    let mut reader = EventReader::new(0);
+    pull.store(true, SeqCst);
+    link.start().expect("start");
+    let mut events = Vec::new();
+    let mut pulls = 3;
+    while !events.iter().any(|e: &Event| matches!(e.kind, EventKind::RunDone { .. })) {
+        reader.poll(&mut link, &mut events).expect("events");
+        std::thread::sleep(Duration::from_millis(30));
+        pull.store(true, SeqCst);
+        pulls += 1;
+    }
+    assert_eq!(events.len(), 202, "{port}");
+    assert!(events.iter().zip(0..).all(|(event, seq)| event.seq == seq));
+    assert_eq!(rig.faults.starts.load(SeqCst), 1, "{port}");
+    let stats = link.stats();
+    eprintln!("{port}: pulled {pulls} times, {stats:?}");
+    assert!(stats.reconnects >= 5, "{stats:?}");
+}
+
+#[test]
+fn a_line_that_is_pulled_out_loses_no_event() {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("bind");
+    let address = listener.local_addr().expect("address");
+    listener.set_nonblocking(true).expect("nonblocking");
+    let plug = move || {
+        let (stream, _) = listener.accept().ok()?;
+        stream.set_read_timeout(Some(Duration::from_millis(1))).ok()?;
+        Some(StreamTransport::new(stream))
+    };
+    let pull = Arc::new(AtomicBool::new(false));
+    survives(&format!("tcp://{address}"), Box::new(Loose { line: None, plug, pull: pull.clone() }), &pull);
+}
+
+#[cfg(unix)]
+#[test]
+fn a_serial_line_that_is_pulled_out_loses_no_event() {
+    let folder = tempfile::TempDir::new().expect("folder");
+    let path = folder.path().join("box");
+    let link = path.clone();
+    let plug = move || {
+        let (master, name) = common::pty::open();
+        std::fs::remove_file(&link).ok();
+        std::os::unix::fs::symlink(name, &link).expect("link");
+        Some(master)
+    };
+    let pull = Arc::new(AtomicBool::new(false));
+    let mut loose = Loose { line: None, plug, pull: pull.clone() };
+    // the port must be there before a host opens it
+    assert_eq!(loose.read(&mut [0; 8], Duration::ZERO).expect("nothing"), 0);
+    survives(path.to_str().expect("utf-8"), Box::new(loose), &pull);
+}
+
+#[test]
+fn a_box_that_was_reset_while_it_was_unplugged_is_told() {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("bind");
+    let address = listener.local_addr().expect("address");
+    listener.set_nonblocking(true).expect("nonblocking");
+    let plug = move || {
+        let (stream, _) = listener.accept().ok()?;
+        stream.set_read_timeout(Some(Duration::from_millis(1))).ok()?;
+        Some(StreamTransport::new(stream))
+    };
+    let pull = Arc::new(AtomicBool::new(false));
+    let rig = TestBox::serve(Box::new(Loose { line: None, plug, pull: pull.clone() }));
+    let mut link = Link::open(&format!("tcp://{address}"), options()).expect("hello");
+    rig.faults.reset.store(true, SeqCst);
+    pull.store(true, SeqCst);
+    std::thread::sleep(Duration::from_millis(20));
+    let error = link.request(&Request::Inputs).expect_err("another boot");
+    assert!(matches!(error, LinkError::BoardReset { .. }), "{error:?}");
 }
 
 /// A stream that takes one byte at a time and gives one byte at a time.

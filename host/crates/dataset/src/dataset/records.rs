@@ -132,6 +132,9 @@ pub struct FrameRecord {
     /// Tick of the camera trigger.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trigger_tick: Option<u64>,
+    /// Tick at which the exposure began: as the box saw it, or else the trigger's and the experiment's delay.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub exposure_tick: Option<u64>,
     /// Exposure in nanoseconds.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub exposure_ns: Option<u64>,
@@ -161,6 +164,7 @@ impl FrameRecord {
             time_error_ns: None,
             commanded_um: None,
             trigger_tick: None,
+            exposure_tick: None,
             exposure_ns: None,
             strobes: Vec::new(),
             note: String::new(),

@@ -164,10 +164,18 @@ fn axis(field: &str, axis: &Axis, f: &mut Findings) {
             "at most 2147483647 steps from home",
         );
     }
-    let rates = [
+    let travel = axis.max.mm() - axis.min.mm();
+    f.require(
+        axis.backlash.mm() >= 0.0 && 2.0 * axis.backlash.mm() < travel,
+        format!("{field}.backlash"),
+        axis.backlash,
+        format!("0 mm to less than half of the travel, {travel} mm"),
+    );
+    let mut rates = vec![
         ("rate", axis.rate.mm_per_s(), axis.rate.to_string(), "step/s"),
         ("acceleration", axis.acceleration.mm_per_s2(), axis.acceleration.to_string(), "step/s^2"),
     ];
+    rates.extend(axis.jerk.map(|jerk| ("jerk", jerk.mm_per_s3(), jerk.to_string(), "step/s^3")));
     for (name, mm, text, unit) in rates {
         let steps = mm * per_mm;
         f.require(

@@ -19,7 +19,9 @@ pub use optics::{
 };
 pub use problem::{ConfigError, Problem, ProblemKind};
 pub use processing::{Criterion, Decoder, Interpolation, Processing, Shape, Solver};
-pub use rig::{Axes, Axis, Bayer, BayerChannel, BayerPattern, CameraSection, CameraSource, Rig, Strobe};
+pub use rig::{
+    Approach, Axes, Axis, Bayer, BayerChannel, BayerPattern, CameraSection, CameraSource, Rig, Strobe,
+};
 pub use sequence::{FrameStep, LevelStep, MoveStep, RepeatStep, Role, Step};
 
 use schemars::JsonSchema;

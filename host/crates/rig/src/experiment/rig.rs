@@ -1,6 +1,6 @@
 //! `[rig]`: trigger box, stage, camera, LEDs.
 
-use crate::units::{Acceleration, Length, Speed, Time};
+use crate::units::{Acceleration, Jerk, Length, Speed, Time};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -226,6 +226,41 @@ pub struct Axis {
     pub rate: Speed,
     /// Acceleration.
     pub acceleration: Acceleration,
+    /// Change of the acceleration per time; left out, it may jump (trapezoid).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub jerk: Option<Jerk>,
+    /// Play of the drive: so far it turns after a reversal before the stage follows.
+    #[serde(default = "no_length", skip_serializing_if = "is_no_length")]
+    pub backlash: Length,
+    /// With a backlash every move ends in this direction: one that would not goes past its target by twice the
+    /// backlash first.
+    #[serde(default, skip_serializing_if = "Approach::is_default")]
+    pub approach: Approach,
+}
+
+/// Direction in which an axis arrives.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Approach {
+    /// Counting up.
+    #[default]
+    Positive,
+    /// Counting down.
+    Negative,
+}
+
+impl Approach {
+    /// +1 or −1.
+    pub fn sign(self) -> i32 {
+        match self {
+            Self::Positive => 1,
+            Self::Negative => -1,
+        }
+    }
+
+    fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
 }
 
 fn sim() -> String {
@@ -239,6 +274,12 @@ fn reply_timeout() -> Time {
 }
 fn frame_timeout() -> Time {
     Time::new(5e9)
+}
+fn no_length() -> Length {
+    Length::new(0.0)
+}
+fn is_no_length(length: &Length) -> bool {
+    length.mm() == 0.0
 }
 fn bits() -> u8 {
     8

@@ -9,12 +9,14 @@ mod error;
 mod events;
 mod stream;
 mod transport;
+mod unroll;
 
 pub(crate) use error::state_name;
 pub use error::{LinkError, Outcome};
 pub use events::EventReader;
 pub use stream::StreamSender;
 pub use transport::{MAX_WRITE, PipeEnd, StreamTransport, Transport, available_ports, open, pipe};
+pub use unroll::Unrolled;
 
 use crate::clock::ClockSample;
 use daic_protocol::frame::{self, Decoder, Fed};
@@ -26,6 +28,9 @@ use daic_protocol::message::{
 use std::io;
 use std::time::{Duration, Instant};
 
+/// Between two attempts to open a port again.
+const REOPEN_EVERY: Duration = Duration::from_millis(50);
+
 /// How patient the link is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LinkOptions {
@@ -35,12 +40,20 @@ pub struct LinkOptions {
     pub timeout: Duration,
     /// How often to ask, at least once.
     pub attempts: u32,
+    /// How long to try to open a port again that was pulled out or whose other end went away; zero: not at all.
+    /// The box keeps its events meanwhile, and a request that was under way is asked again under the same id.
+    pub reconnect: Duration,
 }
 
 impl Default for LinkOptions {
-    /// 115 200 Bd, 200 ms, 5 times.
+    /// 115 200 Bd, 200 ms, 5 times, 10 s.
     fn default() -> Self {
-        Self { baud: 115_200, timeout: Duration::from_millis(200), attempts: 5 }
+        Self {
+            baud: 115_200,
+            timeout: Duration::from_millis(200),
+            attempts: 5,
+            reconnect: Duration::from_secs(10),
+        }
     }
 }
 
@@ -51,6 +64,8 @@ pub struct LinkStats {
     pub answered: u64,
     /// Times a request was sent again.
     pub retries: u64,
+    /// Times the port was opened again.
+    pub reconnects: u64,
     /// Replies that belonged to no open request, such as the second of two after a retry.
     pub stale: u64,
     /// Bytes received.
@@ -63,6 +78,8 @@ pub struct LinkStats {
 pub struct Link {
     transport: Box<dyn Transport>,
     port: String,
+    /// The transport can be had again by opening the port.
+    reopens: bool,
     options: LinkOptions,
     decoder: Decoder,
     hello: Hello,
@@ -92,7 +109,9 @@ impl Link {
     /// The port cannot be opened ([`open`]), or what answers is not a box this program can use
     /// ([`Link::over`]).
     pub fn open(port: &str, options: LinkOptions) -> Result<Self, LinkError> {
-        Self::over(open(port, options.baud)?, port, options)
+        let mut link = Self::over(open(port, options.baud)?, port, options)?;
+        link.reopens = true;
+        Ok(link)
     }
 
     /// Asks over an open transport who is there; `port` names it in errors.
@@ -104,6 +123,7 @@ impl Link {
         let mut link = Self {
             transport,
             port: port.to_owned(),
+            reopens: false,
             options,
             decoder: Decoder::new(),
             hello: nobody(),
@@ -372,23 +392,33 @@ impl Link {
         let bytes = frame::encode_request(id, request).map_err(|_| LinkError::TooLarge { request: name })?;
         let begin = Instant::now();
         let attempts = self.options.attempts.max(1);
-        for attempt in 1..=attempts {
-            self.stats.retries += u64::from(attempt > 1);
+        let (mut attempt, mut reopened) = (0, 0);
+        while attempt < attempts {
+            attempt += 1;
+            self.stats.retries += u64::from(attempt + reopened > 1);
             let sent = Instant::now();
-            match self.transport.write(&bytes, self.options.timeout) {
-                Ok(()) => {}
+            let broken = match self.transport.write(&bytes, self.options.timeout) {
+                Ok(()) => match self.reply(id, sent + self.options.timeout) {
+                    Ok(Some((reply, received))) => {
+                        self.stats.answered += 1;
+                        return Ok(Exchange { reply, sent, received, attempts: attempt + reopened });
+                    }
+                    Ok(None) => None,
+                    Err(e) => Some((true, e)),
+                },
                 // Nobody drains the line: as good as silent.
-                Err(e) if e.kind() == io::ErrorKind::TimedOut => continue,
-                Err(e) => return Err(self.disconnected(name, attempt > 1, e)),
+                Err(e) if e.kind() == io::ErrorKind::TimedOut => None,
+                Err(e) => Some((attempt + reopened > 1, e)),
+            };
+            match broken {
+                None => tracing::debug!(port = self.port, request = name, attempt, "no reply"),
+                Some((sent, source)) => {
+                    let lost = self.disconnected(name, sent, source);
+                    self.reopen(begin, lost)?;
+                    // The box answers a request that it has seen from memory.
+                    (attempt, reopened) = (0, reopened + 1);
+                }
             }
-            let deadline = sent + self.options.timeout;
-            if let Some((reply, received)) =
-                self.reply(id, deadline).map_err(|e| self.disconnected(name, true, e))?
-            {
-                self.stats.answered += 1;
-                return Ok(Exchange { reply, sent, received, attempts: attempt });
-            }
-            tracing::debug!(port = self.port, request = name, attempt, "no reply");
         }
         Err(LinkError::Silent {
             port: self.port.clone(),
@@ -396,6 +426,30 @@ impl Link {
             after_ms: u64::try_from(begin.elapsed().as_millis()).unwrap_or(u64::MAX),
             attempts,
         })
+    }
+
+    /// Opens the port again, for a request that began at `begin`; gives back why it was `lost` if that is not to be had.
+    fn reopen(&mut self, begin: Instant, lost: LinkError) -> Result<(), LinkError> {
+        loop {
+            if !self.reopens || begin.elapsed() >= self.options.reconnect {
+                return Err(lost);
+            }
+            match open(&self.port, self.options.baud) {
+                Ok(transport) => {
+                    tracing::info!(port = self.port, "connected again");
+                    self.transport = transport;
+                    let rejected = self.decoder.rejected;
+                    self.decoder = Decoder::new();
+                    self.decoder.rejected = rejected;
+                    self.stats.reconnects += 1;
+                    // Ends whatever partial frame the box may hold; if it cannot be written, what follows cannot either.
+                    self.transport.write(&[0], self.options.timeout).ok();
+                    return Ok(());
+                }
+                Err(error) => tracing::debug!(port = self.port, %error, "not there yet"),
+            }
+            std::thread::sleep(REOPEN_EVERY);
+        }
     }
 
     /// Reads until the reply to `id` is there; `None` when `deadline` has passed.
