@@ -115,6 +115,9 @@ pub(super) fn edges(host: &mut Host, long: bool) -> Result<Outcome, String> {
 
 /// What has come is played to its end, and the box says where it ran dry.
 pub(super) fn dry(host: &mut Host, _: bool) -> Result<Outcome, String> {
+    if host.target.waits_for_streams() {
+        return Ok(Outcome::Cannot("its clock waits for the stream"));
+    }
     let mut program = vec![];
     for _ in 0..60 {
         program.extend([set(lamp(1), 300 * US), clear(lamp(1), 40 * US)]);
