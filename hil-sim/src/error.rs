@@ -36,6 +36,12 @@ pub enum ConfigError {
     /// A number of the microscope is not allowed.
     #[error("scene.microscope: {0}")]
     Microscope(#[from] daic_optics::microscope::MicroscopeError),
+    /// The light-field microscope cannot be.
+    #[error("scene.lightfield: {0}")]
+    LightField(#[from] daic_lightfield::PsfError),
+    /// The light-field microscope's sensor cannot be.
+    #[error("scene.lightfield: {0}")]
+    LightFieldSensor(#[from] daic_lightfield::OperatorError),
     /// The height map cannot be read.
     #[error("the height map {} cannot be read: {cause}", path.display())]
     HeightMap {

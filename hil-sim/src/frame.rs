@@ -8,6 +8,7 @@ use rayon::prelude::*;
 use crate::config::SimConfig;
 use crate::error::ConfigError;
 use crate::scene::Scene;
+use crate::scene::lightfield::LightFieldScene;
 use crate::sensor::Sensor;
 use crate::world::{ExposureRecord, ns_from_ticks};
 
@@ -52,10 +53,33 @@ pub struct FrameTruth {
 /// Rendered positions kept: series often come back to the same place.
 const KEPT: usize = 3;
 
+/// What is in front of the sensor.
+#[derive(Debug)]
+enum View {
+    Rays(Box<Scene>),
+    LightField(Box<LightFieldScene>),
+}
+
+impl View {
+    fn size(&self) -> (usize, usize) {
+        match self {
+            Self::Rays(scene) => scene.size(),
+            Self::LightField(scene) => scene.size(),
+        }
+    }
+
+    fn render(&self, stage_mm: [f64; 3]) -> Vec<f32> {
+        match self {
+            Self::Rays(scene) => scene.render(stage_mm),
+            Self::LightField(scene) => scene.render(stage_mm),
+        }
+    }
+}
+
 /// Makes frames from exposures.
 #[derive(Debug)]
 pub struct Imager {
-    scene: Scene,
+    scene: View,
     sensor: Sensor,
     config: SimConfig,
     rendered: VecDeque<([f64; 3], Arc<Vec<f32>>)>,
@@ -64,17 +88,19 @@ pub struct Imager {
 impl Imager {
     /// Prepares scene and sensor of a configuration.
     pub fn new(config: &SimConfig) -> Result<Self, ConfigError> {
+        let scene = match &config.scene.lightfield {
+            Some(lightfield) => {
+                config.validate()?;
+                View::LightField(Box::new(LightFieldScene::new(config, lightfield)?))
+            }
+            None => View::Rays(Box::new(Scene::new(config)?)),
+        };
         Ok(Self {
-            scene: Scene::new(config)?,
+            scene,
             sensor: Sensor::new(&config.camera, config.seed),
             config: config.clone(),
             rendered: VecDeque::new(),
         })
-    }
-
-    /// The scene.
-    pub fn scene(&self) -> &Scene {
-        &self.scene
     }
 
     /// Expected photo-electrons per pixel, row by row.

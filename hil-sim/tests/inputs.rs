@@ -130,8 +130,10 @@ impl AsStream for Reply {
     }
 }
 
+/// Stepped time waits for the host (see `STREAM_LOW` in `board.rs`): what is shown is that it does, and that a stream is
+/// played as it was sent. How fast a host must be is shown where time does not wait.
 #[test]
-fn ten_thousand_edges_are_streamed_without_an_under_run() {
+fn ten_thousand_edges_are_streamed_on_the_stepped_clock() {
     let mut config = small();
     config.board.leds[0].max_pulse = u32::MAX;
     let (rig, mut host) = start(config);

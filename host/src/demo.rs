@@ -209,7 +209,7 @@ pub fn simulate(
 }
 
 /// Starts a rig on a PTY, records, and notes the edges that were really played.
-fn record(
+pub(crate) fn record(
     experiment: &Experiment,
     config: SimConfig,
     out: &Path,

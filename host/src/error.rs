@@ -18,7 +18,9 @@ pub enum Error {
         reason: String,
     },
     /// An experiment under the microscope, where the macro set-up's optics are wanted.
-    #[error("this experiment describes a microscope: it has no [optics]")]
+    #[error(
+        "this experiment describes a microscope or a light-field microscope: it has no [optics] (frames of the latter: `daic lightfield reconstruct`)"
+    )]
     NoOptics,
     /// The microscope's frames have been measured without a calibration.
     #[error(
@@ -514,6 +516,9 @@ pub enum Error {
     /// A file of motions or of a microscope.
     #[error(transparent)]
     MicroscopeFile(#[from] crate::microscope::MicroscopeFileError),
+    /// A light field.
+    #[error(transparent)]
+    LightField(#[from] crate::lightfield::LightFieldError),
     /// A plan.
     #[error("no plan: {0}")]
     SetUp(#[from] daic_optics::plan::PlanError),

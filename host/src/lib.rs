@@ -18,6 +18,7 @@
 //! * [`optics_file`]: an optics file with covariance, distortion maps ([`distortion_file`]) and volume, ready to
 //!   decode; [`pairs`] decodes pixel pairs from elsewhere.
 //! * [`sequence`]: the same of a series of images.
+//! * [`lightfield`]: light fields become volumes.
 //! * [`microscope`]: calibration of the microscope from known motions.
 
 pub mod align;
@@ -38,6 +39,9 @@ mod figures;
 pub mod folder_camera;
 pub mod frames;
 pub mod images;
+pub mod lightfield;
+#[cfg(feature = "sim")]
+pub mod lightfield_demo;
 pub mod measure;
 pub mod microscope;
 pub mod noise_floor;

@@ -3,8 +3,8 @@
 use crate::error::Error;
 use crate::optics_section;
 use daic_hil_sim::config::{
-    AxisConfig, BayerConfig, BayerPattern, GratingConfig, LedConfig, LightConfig, MicroscopeConfig,
-    OpticsConfig, SimConfig, SpecimenConfig, SurfaceConfig, TextureConfig,
+    AxisConfig, BayerConfig, BayerPattern, GratingConfig, LedConfig, LightConfig, LightFieldConfig,
+    MicroscopeConfig, OpticsConfig, SimConfig, SpecimenConfig, SurfaceConfig, TextureConfig,
 };
 use daic_hil_sim::frame::SimFrame;
 use daic_optics::{Grating, Optics};
@@ -23,6 +23,9 @@ const FILL: f64 = 0.85;
 /// # Errors
 /// Optics that no set-up can have.
 pub fn configuration(experiment: &Experiment) -> Result<SimConfig, Error> {
+    if experiment.lightfield.is_some() {
+        return Ok(lightfield(experiment));
+    }
     match &experiment.microscope {
         Some(_) => Ok(microscope(experiment)),
         None => {
@@ -61,6 +64,21 @@ pub fn microscope(experiment: &Experiment) -> SimConfig {
     config.camera.full_well_electrons = 25_000.0;
     config.camera.read_noise_electrons = 10.0;
     with_rig(config, experiment, wavelength_mm)
+}
+
+/// The simulated light-field microscope in front of its beads; LED 3 is not connected.
+pub fn lightfield(experiment: &Experiment) -> SimConfig {
+    let mut config = SimConfig::default();
+    let lightfield = LightFieldConfig::default();
+    let wavelength_mm = 1e-3 * lightfield.wavelength_um;
+    config.scene.lightfield = Some(lightfield);
+    config.camera.full_well_electrons = 25_000.0;
+    config.camera.read_noise_electrons = 5.0;
+    let mut config = with_rig(config, experiment, wavelength_mm);
+    if let Some(rate) = config.light.led_electrons_per_s.last_mut() {
+        *rate = 0.0;
+    }
+    config
 }
 
 /// Height of the specimen under the microscope at (x, y), all in millimetres, from the formula of the sphere.

@@ -1,13 +1,14 @@
 //! Reproduces a chapter of the thesis and writes its part of `docs/reproduction.md`:
-//! `reproduce macro|micro [--quick] [DOCS]`.
+//! `reproduce macro|micro|lightfield [--quick] [DOCS]`.
 
-use daic_tests::reproduce::{Extent, ReproduceError, document, macroscopic, microscopic};
+use daic_tests::reproduce::{Extent, ReproduceError, document, lightfield, macroscopic, microscopic};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 fn run(chapter: &str, extent: Extent, docs: &std::path::Path) -> Result<(), ReproduceError> {
     let part = match chapter {
         "macro" => macroscopic::part(&macroscopic::run(extent, &|what| println!("{what}"))?)?,
+        "lightfield" => lightfield::part(&lightfield::run(extent, &|what| println!("{what}"))?)?,
         _ => microscopic::part(&microscopic::run(extent)?)?,
     };
     println!("{}", part.text);
@@ -23,12 +24,12 @@ fn main() -> ExitCode {
         [chapter] => (chapter, daic_tests::shared::root().join("docs")),
         [chapter, docs] => (chapter, PathBuf::from(docs)),
         _ => {
-            eprintln!("reproduce macro|micro [--quick] [DOCS]");
+            eprintln!("reproduce macro|micro|lightfield [--quick] [DOCS]");
             return ExitCode::from(2);
         }
     };
-    if !["macro", "micro"].contains(&chapter.as_str()) {
-        eprintln!("reproduce: no chapter `{chapter}`: macro or micro");
+    if !["macro", "micro", "lightfield"].contains(&chapter.as_str()) {
+        eprintln!("reproduce: no chapter `{chapter}`: macro, micro or lightfield");
         return ExitCode::from(2);
     }
     match run(chapter, extent, &docs) {

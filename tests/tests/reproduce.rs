@@ -1,9 +1,9 @@
-//! Chapters 2 and 3 of the thesis on small fields: what `cargo xtask reproduce` does in full.
+//! Chapters 2, 3 and 4 of the thesis on small fields: what `cargo xtask reproduce` does in full.
 
 use daic_correlate::Shape;
 use daic_tests::reproduce::macroscopic::{self, CONFINED_PX, Decoding};
 use daic_tests::reproduce::microscopic::{self, RIGID, THESIS, Way};
-use daic_tests::reproduce::{Extent, document};
+use daic_tests::reproduce::{Extent, document, lightfield};
 
 #[test]
 fn chapter_2_on_a_small_field() {
@@ -53,5 +53,24 @@ fn chapter_3_on_a_small_field() {
     for (name, _) in &part.figures {
         assert!(page.contains(&format!("figures/{name}.svg")), "{name} is drawn but not shown");
         assert!(folder.path().join(format!("figures/{name}.svg")).is_file());
+    }
+}
+
+#[test]
+fn chapter_4_on_a_small_field() {
+    let results = lightfield::run(Extent::Quick, &|what| eprintln!("{what}")).expect("runs");
+    let part = lightfield::part(&results).expect("a page");
+    eprintln!("{}", part.text);
+    let of = |degrees: f64| &results.angles.iter().find(|a| a.degrees == degrees).expect("an angle").widths;
+    let (plain, with) = (of(0.0), of(30.0));
+    // the grating makes the bead shorter and no wider, and it is where it is
+    assert!(with.fwhm_um[2] < plain.fwhm_um[2] || !plain.fwhm_um[2].is_finite(), "{plain:?} {with:?}");
+    assert!((with.peak_um - 20.0).abs() <= 2.5, "{with:?}");
+    for k in 0..2 {
+        assert!((with.fwhm_um[k] - lightfield::BEAD_UM).abs() < 3.0, "{with:?}");
+    }
+    assert!(results.convergence.windows(2).all(|w| w[1][2] < w[0][2]), "{:?}", results.convergence);
+    for (name, _) in &part.figures {
+        assert!(part.text.contains(&format!("figures/{name}.svg")), "{name} is drawn but not shown");
     }
 }

@@ -28,11 +28,12 @@ cargo xtask COMMAND
   datasheet  measures on the emulated Pico and writes the numbers into docs/datasheet.md
   figures    draws the pictures of README and docs anew with the program itself
   coverage   2 000 simulated calibrations: what the stated uncertainties cover (minutes)
-  reproduce  macro: chapter 2 of the thesis, micro: chapter 3, simulated and measured, into
-             docs/reproduction.md
+  reproduce  macro: chapter 2 of the thesis, micro: chapter 3, lightfield: chapter 4 (about an
+             hour), simulated and measured, into docs/reproduction.md
   fuzz       [--long]: each fuzz target for a minute (an hour); needs a nightly compiler and cargo-fuzz
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders
+             lightfield: speed and memory beside pyolaf, into docs/performance.md
              guard [--update]: instruction counts against the baseline (or: makes a new one)
 ";
 
@@ -55,7 +56,7 @@ fn main() -> ExitCode {
         ["datasheet"] => hil::datasheet(),
         ["figures"] => steps::figures(),
         ["coverage"] => steps::coverage(),
-        ["reproduce", chapter @ ("macro" | "micro")] => steps::reproduce(chapter),
+        ["reproduce", chapter @ ("macro" | "micro" | "lightfield")] => steps::reproduce(chapter),
         ["hil", "--faults", count] if count.parse::<u64>().is_ok() => {
             campaign::faults(count.parse().unwrap_or(0))
         }
@@ -67,6 +68,7 @@ fn main() -> ExitCode {
         ["fuzz", "--long"] => campaign::fuzz(3600),
         ["bench", "correlate"] => bench::correlate(false),
         ["bench", "correlate", "--quick"] => bench::correlate(true),
+        ["bench", "lightfield"] => bench::lightfield::lightfield(),
         ["bench", "optics"] => steps::bench_optics(),
         ["bench", "guard"] => bench::guard::step(false),
         ["bench", "guard", "--update"] => bench::guard::step(true),

@@ -3,10 +3,13 @@
 //! Unknown keys are refused. The defaults are the macro set-up of the published method: 633 nm,
 //! 300 lines/mm, a camera of 2592 × 1944 pixels 307 mm in front of the grating.
 
+mod lightfield;
 mod microscope;
 mod sensor;
 mod validate;
 
+pub(crate) use lightfield::PLANE_UM;
+pub use lightfield::{BeadConfig, LightFieldConfig};
 pub use microscope::MicroscopeConfig;
 pub use sensor::{BayerConfig, BayerPattern};
 
@@ -48,6 +51,8 @@ pub struct SceneConfig {
     pub optics: OpticsConfig,
     /// A microscope in place of `optics`.
     pub microscope: Option<MicroscopeConfig>,
+    /// A light-field microscope in place of all other things of the scene.
+    pub lightfield: Option<LightFieldConfig>,
     /// Width of the light's spectrum.
     pub spectrum: SpectrumConfig,
     /// Shape and extent of the specimen.
@@ -67,6 +72,7 @@ impl Default for SceneConfig {
         Self {
             optics: OpticsConfig::default(),
             microscope: None,
+            lightfield: None,
             spectrum: SpectrumConfig::default(),
             specimen: SpecimenConfig::default(),
             texture: TextureConfig::default(),
@@ -559,6 +565,9 @@ impl SimConfig {
     /// lower bound.
     pub fn pixel_mm(&self) -> f64 {
         let optics = &self.scene.optics;
+        if let Some(l) = &self.scene.lightfield {
+            return 1e-3 * l.lenslet_pitch_um / (l.magnification * l.pitch_px);
+        }
         match &self.scene.microscope {
             None => (optics.pinhole_to_grating_mm + optics.grating_to_reference_mm) / optics.focal_px,
             Some(m) => (m.pixel_mm / (m.objective_magnification * m.relay_magnification)).abs(),

@@ -51,6 +51,27 @@ impl SimConfig {
             within("scene.microscope.focus_height_mm", microscope.focus_height_mm, -1.0, 1.0)?;
             within("scene.microscope.pupil_rings", microscope.pupil_rings as f64, 1.0, 8.0)?;
         }
+        if let Some(lightfield) = &scene.lightfield {
+            within("scene.lightfield.pitch_px", lightfield.pitch_px, 4.0, 500.0)?;
+            within("scene.lightfield.rotation_rad", lightfield.rotation_rad, -0.5, 0.5)?;
+            for &at in &lightfield.centre_px {
+                within("scene.lightfield.centre_px", at, 0.0, 32_768.0)?;
+            }
+            let [from, to] = lightfield.depth_um;
+            within("scene.lightfield.depth_um", to, from, from + 200.0)?;
+            within("scene.lightfield.slide_mm", lightfield.slide_mm, 1e-3, 1e4)?;
+            within("scene.lightfield.peak", lightfield.peak, 0.0, 100.0)?;
+            within("scene.lightfield.radius", lightfield.radius as f64, 0.0, 16.0)?;
+            for bead in &lightfield.beads {
+                within("scene.lightfield.beads.diameter_um", bead.diameter_um, 0.1, 1e3)?;
+                for &at in &bead.centre_um {
+                    within("scene.lightfield.beads.centre_um", at, -1e4, 1e4)?;
+                }
+            }
+            // more is beyond what one operator can hold
+            let size = self.camera.width.max(self.camera.height) as f64;
+            within("camera size over scene.lightfield.pitch_px", size / lightfield.pitch_px, 1.0, 200.0)?;
+        }
         let specimen = &scene.specimen;
         within("scene.specimen.half_width_mm", specimen.half_width_mm, 1e-6, 1e4)?;
         within("scene.specimen.half_height_mm", specimen.half_height_mm, 1e-6, 1e4)?;

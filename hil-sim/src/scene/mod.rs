@@ -1,6 +1,7 @@
 //! What the camera sees: from pixel to surface, ray by ray.
 
 pub mod height_map;
+pub mod lightfield;
 pub mod microscope;
 pub mod quadrature;
 pub mod render;

@@ -2,6 +2,7 @@
 
 use super::align::AlignArgs;
 use super::calibrate::CalibrateArgs;
+use super::lightfield::LightFieldArgs;
 use super::plan::PlanArgs;
 use super::rig::RigArgs;
 use super::strain::{NoiseFloorArgs, ProbeArgs, StrainArgs};
@@ -57,6 +58,8 @@ pub enum Command {
     Track(TrackArgs),
     /// Calibrate an instrument from measurements of something known
     Calibrate(CalibrateArgs),
+    /// Volumes from light-field frames: lattice, point spread function, reconstruction
+    Lightfield(LightFieldArgs),
     /// What a set-up will be able to measure: field, overlaps, uncertainty, light, and what to change
     Plan(PlanArgs),
     /// Line up camera, laser and gratings, step by step, from stored images
@@ -78,6 +81,8 @@ pub enum SceneArg {
     Macro,
     /// The microscope with a grating, 0.3 mm of field
     Microscope,
+    /// The light-field microscope: volumes of moving beads
+    Lightfield,
 }
 
 #[derive(Debug, Args)]
@@ -538,7 +543,7 @@ fn parse_move(text: &str) -> Result<Move, String> {
 fn within(values: [f64; 3], scene: SceneArg) -> Result<(), String> {
     // both views stay on the sensor and the specimen in range within these
     let limits_mm = match scene {
-        SceneArg::Macro => [0.5, 0.5, 2.0],
+        SceneArg::Macro | SceneArg::Lightfield => [0.5, 0.5, 2.0],
         SceneArg::Microscope => [0.012, 0.012, 0.015],
     };
     for ((value, limit), axis) in values.iter().zip(limits_mm).zip(["X", "Y", "Z"]) {
@@ -554,9 +559,13 @@ impl DemoArgs {
     /// The move, within the limits of the scene.
     pub fn move_mm(&self) -> Result<[f64; 3], String> {
         let default = match self.scene {
-            SceneArg::Macro => [0.050, -0.030, 0.200],
+            SceneArg::Macro | SceneArg::Lightfield => [0.050, -0.030, 0.200],
             SceneArg::Microscope => [0.004, -0.003, 0.006],
         };
+        let given = self.r#move.is_some() || self.no_calibration || self.pitch_factor != 1.0;
+        if matches!(self.scene, SceneArg::Lightfield) && given {
+            return Err("--move, --no-calibration and --pitch-factor do not belong to --scene lightfield, whose moves are those of a series".to_owned());
+        }
         if matches!(self.scene, SceneArg::Microscope) && (self.no_calibration || self.pitch_factor != 1.0) {
             return Err("--no-calibration and --pitch-factor belong to --scene macro: the microscope has nothing to go by but its own moves".to_owned());
         }

@@ -22,7 +22,9 @@ use std::path::Path;
 
 #[cfg(feature = "sim")]
 pub fn demo(arguments: &DemoArgs, output: &Output) -> Result<Answer, Error> {
+    let move_mm = arguments.move_mm().map_err(|reason| Error::DemoOption { reason })?;
     let scene = match arguments.scene {
+        SceneArg::Lightfield => return lightfield_demo(arguments, output),
         SceneArg::Macro => daic::demo::Scene::Macro,
         SceneArg::Microscope => daic::demo::Scene::Microscope,
     };
@@ -30,7 +32,7 @@ pub fn demo(arguments: &DemoArgs, output: &Output) -> Result<Answer, Error> {
         scene,
         out: arguments.out.clone(),
         seed: arguments.seed,
-        move_mm: arguments.move_mm().map_err(|reason| Error::DemoOption { reason })?,
+        move_mm,
         pitch_factor: arguments.pitch_factor,
         calibrate: !arguments.no_calibration,
     };
@@ -49,13 +51,34 @@ pub fn demo(arguments: &DemoArgs, output: &Output) -> Result<Answer, Error> {
         let values = format!("{:>14.3}{:>14.3}{:>16.3}{:>14.3}", commanded[i], measured[i], rms[i], sigma[i]);
         writeln!(text, "{axis:<8}{values}").ok();
     }
-    for check in &summary.checks {
+    write_checks(&mut text, &summary.checks, &arguments.out);
+    let passed = summary.passed;
+    Ok(Answer::new(as_json(&summary)?, text).checked(passed))
+}
+
+#[cfg(feature = "sim")]
+fn lightfield_demo(arguments: &DemoArgs, output: &Output) -> Result<Answer, Error> {
+    let summary = daic::lightfield_demo::run(&arguments.out, arguments.seed, output)?;
+    let mut text = String::new();
+    writeln!(text, "{:<10}{:>8}{:>8}{:>8}{:>12}{:>8}{:>8}", "µm", "true x", "y", "z", "found x", "y", "z")
+        .ok();
+    for bead in &summary.beads {
+        let [x, y, z] = bead.true_um;
+        let [fx, fy, fz] = bead.found_um.unwrap_or([f64::NAN; 3]);
+        writeln!(text, "{:<10}{x:>8.2}{y:>8.2}{z:>8.2}{fx:>12.2}{fy:>8.2}{fz:>8.2}", bead.frame).ok();
+    }
+    write_checks(&mut text, &summary.checks, &arguments.out);
+    let passed = summary.passed;
+    Ok(Answer::new(as_json(&summary)?, text).checked(passed))
+}
+
+#[cfg(feature = "sim")]
+fn write_checks(text: &mut String, checks: &[processing::Check], out: &Path) {
+    for check in checks {
         let mark = if check.passed { "ok  " } else { "FAIL" };
         writeln!(text, "{mark}  {}: {} (limit {})", check.name, check.found, check.limit).ok();
     }
-    writeln!(text, "report: {}", arguments.out.join("report.html").display()).ok();
-    let passed = summary.passed;
-    Ok(Answer::new(as_json(&summary)?, text).checked(passed))
+    writeln!(text, "report: {}", out.join("report.html").display()).ok();
 }
 
 #[cfg(feature = "sim")]

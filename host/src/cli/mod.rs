@@ -7,6 +7,7 @@ mod calibrate_distortion;
 mod calibrate_rig;
 mod camera;
 mod commands;
+mod lightfield;
 mod microscope;
 mod output;
 mod plan;
@@ -67,6 +68,7 @@ fn run(command: &Command, output: &Output) -> Result<output::Answer, Error> {
         Command::Displacement(arguments) => surface::displacement(arguments, output),
         Command::Track(arguments) => surface::track(arguments, output),
         Command::Calibrate(arguments) => calibrate::calibrate(arguments, output),
+        Command::Lightfield(arguments) => lightfield::lightfield(arguments, output),
         Command::Plan(arguments) => plan::plan(arguments),
         Command::Align(arguments) => align::align(arguments, output),
         Command::Init(arguments) => commands::init(arguments),

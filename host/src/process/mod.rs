@@ -8,6 +8,7 @@ mod microscope;
 mod report;
 mod summary;
 
+pub(crate) use report::check_table;
 pub use summary::{
     CalibratedParameter, CalibrationSummary, Check, FailedFrame, FieldSummary, FrameCounts, FrameSummary,
     ProfileSummary, Summary,
@@ -513,7 +514,7 @@ fn frame_summary(
 }
 
 /// Largest difference between played and expected edges, and how many were compared.
-fn edge_error(dataset: &Dataset) -> Result<(Option<u64>, usize), Error> {
+pub(crate) fn edge_error(dataset: &Dataset) -> Result<(Option<u64>, usize), Error> {
     let Some(played) = dataset.edges()? else { return Ok((None, 0)) };
     let Some((program, position)) = stored_program(dataset) else { return Ok((None, 0)) };
     let expected = expand::expand(&program, position)?;

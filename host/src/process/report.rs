@@ -156,7 +156,7 @@ fn verdict(checks: &[Check]) -> Verdict {
     Verdict { pass: failed == 0, text }
 }
 
-fn check_table(checks: &[Check]) -> TableBlock {
+pub(crate) fn check_table(checks: &[Check]) -> TableBlock {
     let rows = checks
         .iter()
         .map(|c| {

@@ -8,7 +8,7 @@ use std::path::Path;
 /// One part of the page with its figures.
 #[derive(Debug)]
 pub struct Part {
-    /// Its name: `macro` or `micro`.
+    /// Its name: `macro`, `micro` or `lightfield`.
     pub name: &'static str,
     /// The text in Markdown, without its markers.
     pub text: String,
@@ -17,14 +17,14 @@ pub struct Part {
 }
 
 /// Names of the parts in their order on the page.
-const PARTS: [&str; 2] = ["macro", "micro"];
+const PARTS: [&str; 3] = ["macro", "micro", "lightfield"];
 
 const HEAD: &str = "\
-# Reproduction of chapters 2 and 3
+# Reproduction of chapters 2, 3 and 4
 
-Written by `cargo xtask reproduce macro` and `cargo xtask reproduce micro`; not to be edited by hand. The thesis' set-ups are simulated ray by
-ray through the grating equation and measured with the project's own correlation, calibration and decoding. Seeds are fixed: the same
-source gives the same numbers on every machine. \"Thesis\" are the values printed there, measured on real specimens.
+Written by `cargo xtask reproduce macro`, `cargo xtask reproduce micro` and `cargo xtask reproduce lightfield`; not to be edited by hand. The set-ups of chapters 2 and 3
+are simulated ray by ray through the grating equation and measured with the project's own correlation, calibration and decoding; those of chapter 4 by wave optics, with finer sampling
+than the reconstructions use. Seeds are fixed: the same source gives the same numbers on every machine. \"Thesis\" are the values printed there, measured on real specimens.
 ";
 
 fn markers(name: &str) -> (String, String) {

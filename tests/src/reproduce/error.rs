@@ -41,6 +41,15 @@ pub enum ReproduceError {
     /// The calibration left parameters of the microscope open.
     #[error("the calibration moves leave parameters of the microscope open")]
     Open,
+    /// A point spread function.
+    #[error(transparent)]
+    Psf(#[from] daic_lightfield::PsfError),
+    /// A projection.
+    #[error(transparent)]
+    Projection(#[from] daic_lightfield::OperatorError),
+    /// A volume.
+    #[error(transparent)]
+    Volume(#[from] daic_lightfield::ReconstructError),
     /// Too little was measured.
     #[error("{what}: {found} points, at least {needed} are needed")]
     Few {

@@ -1,12 +1,13 @@
-//! Chapters 2 and 3 of the thesis, simulated with exact physics and measured with the project's own
-//! correlation, calibration and decoding: what `cargo xtask reproduce` runs.
+//! Chapters 2, 3 and 4 of the thesis, simulated with exact physics and measured with the project's own
+//! correlation, calibration, decoding and reconstruction: what `cargo xtask reproduce` runs.
 //!
-//! [`macroscopic`] is chapter 2, [`microscopic`] chapter 3. Each gives numbers (for the tests) and a
+//! [`macroscopic`] is chapter 2, [`microscopic`] chapter 3, [`lightfield`] chapter 4. Each gives numbers (for the tests) and a
 //! [`document::Part`] of `docs/reproduction.md` with its figures. Nothing depends on the machine, the
 //! number of threads or the time.
 
 pub mod document;
 mod error;
+pub mod lightfield;
 pub mod macroscopic;
 pub mod microscopic;
 mod pictures;

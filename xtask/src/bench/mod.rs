@@ -3,6 +3,7 @@
 
 pub mod guard;
 mod kernels;
+pub mod lightfield;
 mod live;
 mod measure;
 mod page;
@@ -96,6 +97,24 @@ fn replace(path: &Path, text: &str) -> std::io::Result<()> {
     std::fs::rename(&part, path)
 }
 
+/// Sections of a page that other commands write, from the first marker on.
+fn sections(path: &Path) -> String {
+    let text = std::fs::read_to_string(path).unwrap_or_default();
+    text.find("<!-- section ").map_or(String::new(), |at| format!("\n{}", &text[at..]))
+}
+
+/// Replaces the section of a page between its markers, or adds it at the end.
+fn replace_section(path: &Path, name: &str, text: &str) -> Result<(), String> {
+    let (begin, end) = (format!("<!-- section {name} -->"), format!("<!-- end {name} -->"));
+    let mut page = std::fs::read_to_string(path).map_err(|e| format!("{}: {e}", path.display()))?;
+    let section = format!("{begin}\n\n{}\n\n{end}\n", text.trim());
+    match (page.find(&begin), page.find(&end)) {
+        (Some(from), Some(to)) if from < to => page.replace_range(from..to + end.len() + 1, &section),
+        _ => page = format!("{}\n\n{section}", page.trim_end()),
+    }
+    replace(path, &page).map_err(|e| format!("{}: {e}", path.display()))
+}
+
 /// The whole benchmark.
 pub fn correlate(quick: bool) -> Report {
     let extent = if quick { QUICK } else { FULL };
@@ -155,7 +174,8 @@ pub fn correlate(quick: bool) -> Report {
         let page = page::write(&findings);
         let path = if quick { folder().join("performance.md") } else { root().join("docs/performance.md") };
         println!("{page}");
-        outcome(replace(&path, &page).map_err(|e| format!("{}: {e}", path.display())))
+        let kept = sections(&path);
+        outcome(replace(&path, &(page + &kept)).map_err(|e| format!("{}: {e}", path.display())))
     });
     report
 }

@@ -54,7 +54,7 @@ fn cold(line: &Value, what: &str) -> Vec<f64> {
     line["cold"][what].as_f64().into_iter().collect()
 }
 
-fn said(program: &str, arguments: &[&str]) -> String {
+pub fn said(program: &str, arguments: &[&str]) -> String {
     let output = Command::new(program).args(arguments).output();
     let text = output.map(|o| String::from_utf8_lossy(&o.stdout).trim().to_owned()).unwrap_or_default();
     if text.is_empty() { "unknown".into() } else { text }

@@ -15,6 +15,7 @@ mod lattice;
 pub mod map;
 mod npz;
 pub mod table;
+pub mod volume;
 
 pub use atomic::WriteError;
 pub use dataset::{
@@ -26,3 +27,4 @@ pub use lattice::Lattice;
 pub use map::{FloatMap, MapAxes, MapError};
 pub use npz::NpzError;
 pub use table::{Column, Table, TableError};
+pub use volume::{Volume, VolumeError, read_stack};

@@ -16,6 +16,7 @@ pub mod line;
 pub mod number;
 pub mod overlay;
 pub mod scene3d;
+pub mod stack;
 mod svg;
 pub mod timeline;
 
@@ -27,5 +28,6 @@ pub use line::{Chart, Series, SeriesStyle};
 pub use number::{plain, with_uncertainty};
 pub use overlay::{Mark, Overlay};
 pub use scene3d::HeightSurface;
+pub use stack::ImageStack;
 pub use svg::{Markup, escape};
 pub use timeline::{AnalogTrace, DigitalLine, Timeline};

@@ -44,13 +44,27 @@ impl Findings {
 pub(super) fn experiment(e: &Experiment) -> Vec<Finding> {
     let mut f = Findings::default();
     rig(&e.rig, &mut f);
-    match (&e.optics, &e.microscope) {
-        (Some(o), None) => optics(o, &mut f),
-        (None, Some(m)) => microscope(m, &mut f),
-        (Some(_), Some(_)) => {
-            f.require(false, "microscope", "given besides [optics]", "one of [optics] and [microscope]");
-        }
-        (None, None) => f.require(false, "optics", "left out", "one of [optics] and [microscope]"),
+    const ONE: &str = "one of [optics], [microscope] and [lightfield]";
+    let given = [
+        ("optics", e.optics.is_some()),
+        ("microscope", e.microscope.is_some()),
+        ("lightfield", e.lightfield.is_some()),
+    ];
+    let mut given = given.into_iter().filter(|(_, there)| *there).map(|(name, _)| name);
+    match (given.next(), given.next()) {
+        (None, _) => f.require(false, "optics", "left out", ONE),
+        (Some(first), Some(second)) => f.require(false, second, format!("given besides [{first}]"), ONE),
+        (Some(_), None) => {}
+    }
+    if let Some(o) = &e.optics {
+        optics(o, &mut f);
+    }
+    if let Some(m) = &e.microscope {
+        microscope(m, &mut f);
+    }
+    if let Some(l) = &e.lightfield {
+        let named = !l.setup.trim().is_empty();
+        f.require(named, "lightfield.setup", "empty", "the path of a setup file");
     }
     processing(&e.processing, &mut f);
     sequence(e, &mut f);

@@ -6,6 +6,7 @@
 //! for editors.
 
 mod check;
+mod lightfield;
 mod microscope;
 mod optics;
 mod problem;
@@ -13,6 +14,7 @@ mod processing;
 mod rig;
 mod sequence;
 
+pub use lightfield::LightField;
 pub use microscope::{Microscope, MicroscopeForm};
 pub use optics::{
     Brown, Covariance, Grating, MapFile, Maps, Optics, OpticsFile, Reference, Side, Substrate, Volume,
@@ -38,12 +40,15 @@ pub struct Experiment {
     pub seed: u64,
     /// Trigger box, stage, camera, LEDs.
     pub rig: Rig,
-    /// What the light passes through; this or `microscope`.
+    /// What the light passes through; this, `microscope` or `lightfield`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub optics: Option<Optics>,
     /// The microscope that the light passes through.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub microscope: Option<Microscope>,
+    /// The light-field microscope that the light passes through.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lightfield: Option<LightField>,
     /// How frames become results.
     #[serde(default)]
     pub processing: Processing,
@@ -59,6 +64,11 @@ pub fn template() -> &'static str {
 /// A commented experiment under the microscope, valid as it stands.
 pub fn microscope_template() -> &'static str {
     include_str!("microscope.toml")
+}
+
+/// A commented experiment under the light-field microscope, valid as it stands.
+pub fn lightfield_template() -> &'static str {
+    include_str!("lightfield.toml")
 }
 
 impl Experiment {

@@ -1,0 +1,212 @@
+//! Speed of the light-field reconstruction; one JSON line for each measurement. Used by
+//! `cargo xtask bench lightfield`.
+//!
+//! Arguments: what is to be measured (`psf`, `rl`, `isra`, `dlfm`, `size`, `psf-plane`), threads, repeats.
+
+use daic_lightfield::{
+    DiffractionModel, Frame, Grating, Method, Model, Normal, Operator, OperatorSettings, Order, Oversampling,
+    Psf, PsfParameters, Radius, Settings, Storage, native_widths, reconstruct,
+};
+use std::time::Instant;
+
+/// Seconds of processor time of this process.
+fn cpu() -> f64 {
+    #[cfg(target_os = "linux")]
+    {
+        // utime and stime, fields 14 and 15, in ticks of 10 ms, would be too coarse
+        let text = std::fs::read_to_string("/proc/self/schedstat").unwrap_or_default();
+        let main: f64 = text.split_whitespace().next().and_then(|v| v.parse().ok()).unwrap_or(f64::NAN);
+        let mut all = 0.0;
+        for entry in std::fs::read_dir("/proc/self/task").into_iter().flatten().flatten() {
+            let text = std::fs::read_to_string(entry.path().join("schedstat")).unwrap_or_default();
+            all += text.split_whitespace().next().and_then(|v| v.parse::<f64>().ok()).unwrap_or(0.0);
+        }
+        f64::max(all, main) * 1e-9
+    }
+    #[cfg(not(target_os = "linux"))]
+    {
+        f64::NAN
+    }
+}
+
+fn median(mut v: Vec<f64>) -> (f64, f64, f64) {
+    v.sort_by(f64::total_cmp);
+    (v[v.len() / 2], v[0], v[v.len() - 1])
+}
+
+/// The `bench` geometry: z = −20…20 µm.
+fn parameters(grating: Option<Grating>) -> PsfParameters {
+    PsfParameters {
+        grating,
+        radius: Radius::Cells(if grating.is_some() { 5 } else { 4 }),
+        oversampling: Oversampling::Samples(5),
+        allow_under_sampling: true,
+        ..PsfParameters::thesis((0..17).map(|z| -20.0 + 2.5 * f64::from(z)).collect())
+    }
+}
+
+fn psf(grating: Option<Grating>) -> (Psf, f64) {
+    let before = cpu();
+    let psf = Psf::compute(&parameters(grating)).expect("the published microscope");
+    (psf, cpu() - before)
+}
+
+/// Beads on a weak background, the same in every run.
+fn volume(n: usize) -> Vec<f32> {
+    let mut state = 1u64;
+    (0..n)
+        .map(|_| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            let u = (state >> 40) as f32 / (1u64 << 24) as f32;
+            if u < 0.01 { 50.0 * u * 100.0 } else { 0.05 }
+        })
+        .collect()
+}
+
+struct Case<'a> {
+    name: &'a str,
+    model: Model,
+    settings: Settings,
+    build: f64,
+}
+
+fn time(case: &Case<'_>, repeats: usize) {
+    let m = &case.model;
+    let shape = m.operator.volume_shape();
+    let g = volume(shape.iter().product());
+    let image = m.operator.project(&[&g]).expect("sizes fit").remove(0);
+    let width = m.operator.image_shape()[1];
+    let images: Vec<Vec<f32>> = (0..m.orders)
+        .map(|o| match o {
+            0 => image.clone(),
+            _ => {
+                image.chunks_exact(width).flat_map(|r| r.iter().rev().copied().collect::<Vec<_>>()).collect()
+            }
+        })
+        .collect();
+    let frame = [Frame { images: images.iter().map(Vec::as_slice).collect(), ..Frame::default() }];
+    let (mut cpus, mut walls, mut first_cpus) = (Vec::new(), Vec::new(), Vec::new());
+    for _ in 0..repeats {
+        // iterations alone: the time of eight minus that of none is not asked; everything after the operator
+        let (c, w) = (cpu(), Instant::now());
+        let mut marks = Vec::new();
+        reconstruct(m, &frame, &case.settings, None, &mut |_| {
+            marks.push(cpu());
+            true
+        })
+        .expect("a frame that can be reconstructed");
+        cpus.push(cpu() - c);
+        walls.push(w.elapsed().as_secs_f64());
+        if let [a, .., b] = marks[..] {
+            first_cpus.push((b - a) / (marks.len() - 1) as f64);
+        }
+    }
+    let ((cpu_s, low, high), (wall, ..)) = (median(cpus), median(walls));
+    let (each, ..) = median(if first_cpus.is_empty() { vec![f64::NAN] } else { first_cpus });
+    let memory = m.operator.memory();
+    let bytes = m.normal.as_ref().map_or(memory.blocks, Normal::bytes);
+    println!(
+        "{{\"case\":\"{}\",\"threads\":{},\"cpu\":{cpu_s:.6},\"cpu_low\":{low:.6},\"cpu_high\":{high:.6},\"wall\":{wall:.6},\"iteration_cpu\":{each:.6},\"iterations\":{},\"block_bytes\":{bytes},\"peak_bytes\":{},\"reduction\":\"{:?}\",\"grid\":[{},{}],\"build_cpu\":{:.4}}}",
+        case.name,
+        rayon::current_num_threads(),
+        case.settings.iterations,
+        memory.peak(),
+        m.normal.as_ref().map_or(memory.reduction, Normal::reduction),
+        memory.grid[0],
+        memory.grid[1],
+        case.build,
+    );
+}
+
+fn model(psf: &Psf, settings: &OperatorSettings, orders: usize, normal: bool) -> (Model, f64) {
+    let before = cpu();
+    let model = Model {
+        operator: Operator::new(psf, settings).expect("a possible grid"),
+        orders,
+        normal: if normal { Normal::new(psf, settings.cells, settings.storage, orders) } else { None },
+        voxel_um: [2.5; 3],
+        widths: native_widths(&psf.parameters),
+    };
+    (model, cpu() - before)
+}
+
+fn run(what: &str, repeats: usize) {
+    let plus = Grating { pitch_um: 0.9, order: Order::Plus, model: DiffractionModel::Virtual };
+    let cells = [35, 35];
+    match what {
+        "psf" => {
+            for (name, grating) in [("psf", None), ("psf-dlfm", Some(plus))] {
+                let seconds = psf(grating).1;
+                println!("{{\"case\":\"{name}\",\"cpu\":{seconds:.4},\"planes\":17}}");
+            }
+        }
+        "psf-plane" => {
+            // one plane at sufficient sampling, 75 samples a lenslet as the peer at Nnum 75
+            let p = PsfParameters { planes_um: vec![20.0], ..parameters(None) };
+            let before = cpu();
+            Psf::compute(&p).expect("the published microscope");
+            println!("{{\"case\":\"psf-plane\",\"cpu\":{:.4},\"planes\":1}}", cpu() - before);
+        }
+        "rl" | "isra" | "dlfm" => {
+            let dlfm = what == "dlfm";
+            let (psf, _) = psf(dlfm.then_some(plus));
+            let orders = if dlfm { 2 } else { 1 };
+            let margin = psf.radius as isize;
+            let storages = [("f32", Storage::F32), ("f16", Storage::F16)];
+            for (name, storage) in storages {
+                let same = OperatorSettings { storage, ..OperatorSettings::new(cells) };
+                let large = OperatorSettings { margin, ..same };
+                let mut list = Vec::new();
+                if what != "isra" {
+                    list.push(("rl", same, Method::Rl, false));
+                }
+                if what != "rl" {
+                    list.push(("isra-normal", large, Method::Isra, true));
+                    list.push(("isra-two-passes", same, Method::Isra, false));
+                }
+                for (kind, settings, method, normal) in list {
+                    let (model, build) = model(&psf, &settings, orders, normal);
+                    let name = format!("{}{kind}-{name}", if dlfm { "dlfm-" } else { "" });
+                    let case = Case { name: &name, model, settings: Settings::new(method, 8), build };
+                    time(&case, repeats);
+                }
+            }
+            if what == "rl" {
+                let settings = OperatorSettings { use_symmetry: false, ..OperatorSettings::new(cells) };
+                let (model, build) = model(&psf, &settings, 1, false);
+                let case =
+                    Case { name: "rl-complex-f32", model, settings: Settings::new(Method::Rl, 8), build };
+                time(&case, repeats);
+            }
+        }
+        "size" => {
+            // cost against lenslets and planes
+            for (n, planes) in [(35, 17), (50, 17), (70, 17), (35, 9), (35, 31), (101, 31)] {
+                let p = PsfParameters {
+                    planes_um: (0..planes)
+                        .map(|z| -20.0 + 40.0 * f64::from(z) / f64::from(planes - 1))
+                        .collect(),
+                    ..parameters(None)
+                };
+                let psf = Psf::compute(&p).expect("the published microscope");
+                let (model, build) = model(&psf, &OperatorSettings::new([n, n]), 1, false);
+                let name = format!("rl-f32-{n}x{n}x{planes}");
+                let case = Case { name: &name, model, settings: Settings::new(Method::Rl, 8), build };
+                time(&case, repeats.min(3));
+            }
+            let peak = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+            let peak = peak.lines().find_map(|l| l.strip_prefix("VmHWM:"));
+            let kib: f64 = peak.and_then(|v| v.split_whitespace().next()?.parse().ok()).unwrap_or(f64::NAN);
+            println!("{{\"case\":\"size-memory\",\"peak_mib\":{:.0}}}", kib / 1024.0);
+        }
+        other => eprintln!("nothing is called `{other}`"),
+    }
+}
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let number = |i: usize, default: usize| arguments.get(i).and_then(|v| v.parse().ok()).unwrap_or(default);
+    let what = arguments.first().map_or("rl", String::as_str).to_owned();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(number(1, 1)).build().expect("threads");
+    pool.install(|| run(&what, number(2, 15)));
+}

@@ -1,0 +1,268 @@
+//! Fourier transforms over the lenslet grid, vectorised over the channels of a cell.
+//!
+//! Stockham's autosort form with radices 2, 3, 4 and 5; no bit reversal, two buffers.
+
+use crate::simd::{LANES, V};
+use fearless_simd::prelude::*;
+
+/// Length and twiddle factors of a transform.
+#[derive(Debug, Clone)]
+pub(crate) struct Plan {
+    pub(crate) n: usize,
+    stages: Vec<Stage>,
+}
+
+#[derive(Debug, Clone)]
+struct Stage {
+    radix: usize,
+    /// Butterflies of the stage.
+    m: usize,
+    /// Distance of what belongs together.
+    stride: usize,
+    /// (cos, sin) of −2π p k/(radix m) for p = 0…m−1, k = 1…radix−1.
+    twiddles: Vec<[f32; 2]>,
+}
+
+/// The smallest length ≥ n that is made of the radices.
+pub(crate) fn good_length(n: usize) -> usize {
+    let smooth = |mut k: usize| {
+        for f in [2, 3, 5] {
+            while k.is_multiple_of(f) {
+                k /= f;
+            }
+        }
+        k == 1
+    };
+    (n.max(1)..).find(|&k| smooth(k)).unwrap_or(n)
+}
+
+#[derive(Clone, Copy)]
+pub(crate) struct C<S: Simd> {
+    pub(crate) re: V<S>,
+    pub(crate) im: V<S>,
+}
+
+impl<S: Simd> C<S> {
+    #[inline(always)]
+    pub(crate) fn zero(s: S) -> Self {
+        Self { re: V::splat(s, 0.0), im: V::splat(s, 0.0) }
+    }
+
+    #[inline(always)]
+    fn plus(self, o: Self) -> Self {
+        Self { re: self.re + o.re, im: self.im + o.im }
+    }
+
+    #[inline(always)]
+    fn minus(self, o: Self) -> Self {
+        Self { re: self.re - o.re, im: self.im - o.im }
+    }
+
+    /// Times −i, or +i for the inverse.
+    #[inline(always)]
+    fn turn<const INVERSE: bool>(self) -> Self {
+        if INVERSE { Self { re: -self.im, im: self.re } } else { Self { re: self.im, im: -self.re } }
+    }
+
+    #[inline(always)]
+    fn scaled(self, f: V<S>) -> Self {
+        Self { re: self.re * f, im: self.im * f }
+    }
+
+    /// self + f·o.
+    #[inline(always)]
+    fn plus_scaled(self, f: V<S>, o: Self) -> Self {
+        Self { re: f.mul_add(o.re, self.re), im: f.mul_add(o.im, self.im) }
+    }
+
+    #[inline(always)]
+    fn times<const INVERSE: bool>(self, s: S, w: [f32; 2]) -> Self {
+        let (c, d) = (V::splat(s, w[0]), V::splat(s, if INVERSE { -w[1] } else { w[1] }));
+        Self { re: self.re * c - self.im * d, im: self.re * d + self.im * c }
+    }
+}
+
+#[inline(always)]
+fn dft2<S: Simd>(x: [C<S>; 2]) -> [C<S>; 2] {
+    [x[0].plus(x[1]), x[0].minus(x[1])]
+}
+
+#[inline(always)]
+fn dft3<S: Simd, const INVERSE: bool>(s: S, x: [C<S>; 3]) -> [C<S>; 3] {
+    let sum = x[1].plus(x[2]);
+    let difference = x[1].minus(x[2]).scaled(V::splat(s, 0.866_025_4)).turn::<INVERSE>();
+    let middle = x[0].plus_scaled(V::splat(s, -0.5), sum);
+    [x[0].plus(sum), middle.plus(difference), middle.minus(difference)]
+}
+
+#[inline(always)]
+fn dft4<S: Simd, const INVERSE: bool>(x: [C<S>; 4]) -> [C<S>; 4] {
+    let (a, b) = (x[0].plus(x[2]), x[0].minus(x[2]));
+    let (c, d) = (x[1].plus(x[3]), x[1].minus(x[3]).turn::<INVERSE>());
+    [a.plus(c), b.plus(d), a.minus(c), b.minus(d)]
+}
+
+#[inline(always)]
+fn dft5<S: Simd, const INVERSE: bool>(s: S, x: [C<S>; 5]) -> [C<S>; 5] {
+    let (c1, c2) = (V::splat(s, 0.309_017), V::splat(s, -0.809_017));
+    let (s1, s2) = (V::splat(s, 0.951_056_5), V::splat(s, 0.587_785_25));
+    let (a, b) = (x[1].plus(x[4]), x[2].plus(x[3]));
+    let (d, e) = (x[1].minus(x[4]), x[2].minus(x[3]));
+    let p = x[0].plus_scaled(c1, a).plus_scaled(c2, b);
+    let q = x[0].plus_scaled(c2, a).plus_scaled(c1, b);
+    let u = d.scaled(s1).plus_scaled(s2, e).turn::<INVERSE>();
+    let v = d.scaled(s2).plus_scaled(-s1, e).turn::<INVERSE>();
+    [x[0].plus(a).plus(b), p.plus(u), q.plus(v), q.minus(v), p.minus(u)]
+}
+
+/// Complex numbers of one group of lanes.
+pub(crate) const PART: usize = 2 * LANES;
+
+#[inline(always)]
+fn get<S: Simd>(s: S, buffer: &[f32], i: usize) -> C<S> {
+    let part = &buffer[i * PART..][..PART];
+    C { re: V::from_slice(s, &part[..LANES]), im: V::from_slice(s, &part[LANES..]) }
+}
+
+#[inline(always)]
+fn put<S: Simd>(buffer: &mut [f32], i: usize, c: C<S>) {
+    let part = &mut buffer[i * PART..][..PART];
+    c.re.store_slice(&mut part[..LANES]);
+    c.im.store_slice(&mut part[LANES..]);
+}
+
+impl Plan {
+    /// `n` must be a [`good_length`].
+    pub(crate) fn new(n: usize) -> Self {
+        let (mut rest, mut stride, mut stages) = (n, 1, Vec::new());
+        for radix in [5, 4, 3, 2] {
+            while rest.is_multiple_of(radix) {
+                let m = rest / radix;
+                let twiddles = (0..m)
+                    .flat_map(|p| (1..radix).map(move |k| (p * k) as f64 / (radix * m) as f64))
+                    .map(|turn| {
+                        let (sin, cos) = (-std::f64::consts::TAU * turn).sin_cos();
+                        [cos as f32, sin as f32]
+                    })
+                    .collect();
+                stages.push(Stage { radix, m, stride, twiddles });
+                rest = m;
+                stride *= radix;
+            }
+        }
+        Self { n, stages }
+    }
+
+    /// Numbers of the two buffers together.
+    pub(crate) fn scratch(&self) -> usize {
+        2 * self.n * PART
+    }
+
+    /// Transforms what `load` gives; the result lies in the first half of `scratch`, complex number by
+    /// complex number. No scaling.
+    #[inline(always)]
+    pub(crate) fn run<S: Simd, const INVERSE: bool>(
+        &self,
+        s: S,
+        scratch: &mut [f32],
+        load: impl Fn(usize) -> C<S>,
+    ) {
+        let scratch = &mut scratch[..self.scratch()];
+        let (result, other) = scratch.split_at_mut(self.n * PART);
+        // the last stage writes into `result`
+        let input = if self.stages.len().is_multiple_of(2) { result } else { other };
+        for i in 0..self.n {
+            put(input, i, load(i));
+        }
+        self.stages_on::<S, INVERSE>(s, scratch);
+    }
+
+    /// All stages; a function of its own, as every caller's copy would take long to compile.
+    #[inline(never)]
+    fn stages_on<S: Simd, const INVERSE: bool>(&self, s: S, scratch: &mut [f32]) {
+        s.vectorize(
+            #[inline(always)]
+            || {
+                let (result, other) = scratch.split_at_mut(self.n * PART);
+                let count = self.stages.len();
+                for (i, stage) in self.stages.iter().enumerate() {
+                    if (count - i) % 2 == 1 {
+                        stage.run::<S, INVERSE>(s, other, result);
+                    } else {
+                        stage.run::<S, INVERSE>(s, result, other);
+                    }
+                }
+            },
+        );
+    }
+}
+
+/// Complex number `i` of a result of [`Plan::run`].
+#[inline(always)]
+pub(crate) fn result<S: Simd>(s: S, scratch: &[f32], i: usize) -> C<S> {
+    get(s, scratch, i)
+}
+
+impl Stage {
+    #[inline(always)]
+    fn run<S: Simd, const INVERSE: bool>(&self, s: S, from: &[f32], to: &mut [f32]) {
+        match self.radix {
+            2 => self.pass::<S, 2, INVERSE>(
+                s,
+                from,
+                to,
+                #[inline(always)]
+                |x| dft2(x),
+            ),
+            3 => self.pass::<S, 3, INVERSE>(
+                s,
+                from,
+                to,
+                #[inline(always)]
+                |x| dft3::<S, INVERSE>(s, x),
+            ),
+            4 => self.pass::<S, 4, INVERSE>(
+                s,
+                from,
+                to,
+                #[inline(always)]
+                |x| dft4::<S, INVERSE>(x),
+            ),
+            _ => self.pass::<S, 5, INVERSE>(
+                s,
+                from,
+                to,
+                #[inline(always)]
+                |x| dft5::<S, INVERSE>(s, x),
+            ),
+        }
+    }
+
+    #[inline(always)]
+    fn pass<S: Simd, const R: usize, const INVERSE: bool>(
+        &self,
+        s: S,
+        from: &[f32],
+        to: &mut [f32],
+        dft: impl Fn([C<S>; R]) -> [C<S>; R],
+    ) {
+        for p in 0..self.m {
+            for q in 0..self.stride {
+                let mut x = [C::zero(s); R];
+                for k in 0..R {
+                    x[k] = get(s, from, q + self.stride * (p + self.m * k));
+                }
+                let y = dft(x);
+                put(to, q + self.stride * R * p, y[0]);
+                for k in 1..R {
+                    let value = if p == 0 {
+                        y[k]
+                    } else {
+                        y[k].times::<INVERSE>(s, self.twiddles[p * (R - 1) + k - 1])
+                    };
+                    put(to, q + self.stride * (R * p + k), value);
+                }
+            }
+        }
+    }
+}
