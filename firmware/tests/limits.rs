@@ -187,7 +187,7 @@ fn what_comes_out_keeps_every_limit() {
             let (mut levels, mut ends_pressed) = (0, 0);
             let mut real = 0i64;
             let mut seen = 0;
-            let mut world = world.into_iter().map(|(gap, what)| (gap, what)).peekable();
+            let mut world = world.into_iter().peekable();
             let mut next = world.next().map(|(gap, what)| (rig.now + gap, what));
             // The low switch of axis 0 is pressed where the stage really stands.
             for _ in 0..4000 {
