@@ -8,7 +8,7 @@ use crate::player::{Player, Progress, Stage, trigger_edges, unhomed};
 use crate::replies::{Replies, Seen};
 use crate::self_test;
 use crate::stream::Source;
-use crate::verifier::{Checker, Choice};
+use crate::verifier::{Checker, Choice, violation};
 use daic_protocol::channels::{EXPOSURE_MASK, INTERLOCK, LIMIT_MASK};
 use daic_protocol::frame::{Decoder, Fed, FrameBytes, TooLarge, encode_reply};
 use daic_protocol::limits::*;
@@ -40,6 +40,8 @@ pub struct Controller {
     /// The host's silence has been noticed: what it says comes too late.
     host_lost: bool,
     now: u64,
+    /// How far the last stream had come when it ended.
+    last_stream: Option<StreamState>,
     /// Words up to this tick are out of hand.
     horizon: u64,
     health: Health,
@@ -63,6 +65,7 @@ impl Controller {
             host: 0,
             host_lost: false,
             now: 0,
+            last_stream: None,
             horizon: 0,
             health: Health::default(),
         }
@@ -364,6 +367,7 @@ impl Controller {
                 }
             }
         }
+        self.out.end_exposures(tick, EXPOSURE_GRACE);
         self.stream_ended(tick);
         self.out.note(tick, EventKind::Faulted { cause, instruction });
         self.player = None;
@@ -372,6 +376,7 @@ impl Controller {
     }
 
     fn stream_ended(&mut self, tick: u64) {
+        self.last_stream = self.stream().or(self.last_stream);
         if let Some(ticks) = self.loader.stream().map(|s| s.min_lead()) {
             self.out.note(tick, EventKind::StreamLead { ticks });
             self.loader.end_stream();
@@ -388,10 +393,19 @@ impl Controller {
     /// As `SlotLoad`, `Arm` and `Start` one after the other.
     pub fn autostart(&mut self, now: u64, slot: u8, sink: &mut dyn Sink) -> Result<(), Refusal> {
         self.now = self.now.max(now);
+        if !matches!(self.state, State::Empty | State::Loaded) {
+            return self.wrong_state();
+        }
+        self.may_start()?;
+        // A host that has left half a program behind must not keep the box from working by itself.
+        self.loader.abort();
         self.slot_load(slot, sink)?;
         let hash = self.loader.hash().unwrap_or(0);
-        self.arm(hash)?;
-        self.start()
+        let started = self.arm(hash).and_then(|()| self.start());
+        if started.is_err() {
+            self.disarm();
+        }
+        started
     }
 
     fn instruction(&self) -> u16 {
@@ -440,7 +454,12 @@ impl Controller {
             Request::Status => return encode_reply(id, &Reply::Status(self.status())),
             Request::Clock => return encode_reply(id, &Reply::Clock { tick: now }),
             Request::ReadEvents { from } => return self.events(id, *from),
-            Request::StreamStatus => return self.stream_reply(id, Ok(())),
+            Request::StreamStatus => {
+                // Of one that has ended, how far it came.
+                let state = self.stream().or(self.last_stream).map(Reply::Stream);
+                let none = Reply::Refused(Refusal::NotStreaming);
+                return encode_reply(id, &state.unwrap_or(none));
+            }
             Request::Inputs => return encode_reply(id, &Reply::Inputs(self.input_counts())),
             Request::Slots => return encode_reply(id, &Reply::Slots(sink.slots())),
             Request::Health => return encode_reply(id, &Reply::Health(self.health)),
@@ -598,12 +617,19 @@ impl Controller {
         if self.player.is_some() || self.loader.hash().is_none() {
             return self.wrong_state();
         }
+        if let Autostart::Input { input } = autostart
+            && input >= self.board.inputs
+        {
+            let (value, limit) = (i64::from(input), i64::from(self.board.inputs));
+            return Err(Refusal::Invalid(violation(0, Rule::NoSuchInput, value, limit)));
+        }
         sink.store(slot, self.loader.program(), autostart).map_err(|error| Refusal::Slot { slot, error })
     }
 
     fn slot_load(&mut self, slot: u8, sink: &mut dyn Sink) -> Result<(), Refusal> {
         match self.state {
-            State::Empty | State::Loaded => {
+            // What is being loaded would be lost, whatever the slot holds.
+            State::Empty | State::Loaded if !self.loader.is_staging() => {
                 let fetch = |program: &mut ProgramBytes| {
                     sink.fetch(slot, program).map_err(|error| Refusal::Slot { slot, error })
                 };
@@ -611,19 +637,21 @@ impl Controller {
                 self.state = State::Loaded;
                 Ok(())
             }
-            State::Armed | State::Running | State::Faulted => self.wrong_state(),
+            _ => self.wrong_state(),
         }
     }
 
     /// A stream that waits to be started makes way; one that is played does not.
     fn load_begin(&mut self, length: u32) -> Result<(), Refusal> {
-        if self.loader.stream().is_some() {
-            if self.player.is_some() {
-                return self.wrong_state();
-            }
+        let streams = self.loader.stream().is_some();
+        if streams && self.player.is_some() {
+            return self.wrong_state();
+        }
+        self.loader.begin(length)?;
+        if streams {
             self.state = self.at_rest();
         }
-        self.loader.begin(length)
+        Ok(())
     }
 
     fn commit(&mut self, length: u32, hash: u32) -> Result<(), Refusal> {
@@ -659,14 +687,7 @@ impl Controller {
         if self.loader.stream().is_some_and(|s| s.is_empty()) {
             return Err(Refusal::StreamEnded { length: 0 });
         }
-        if self.is_interlocked() {
-            return Err(Refusal::InterlockOpen);
-        }
-        let start = self.now.max(self.out.last()).saturating_add(self.board.start_lead);
-        // The proof begins with nothing owed.
-        if let Some((ticks, led)) = self.out.owed(start) {
-            return Err(Refusal::Cooling { led, ticks });
-        }
+        let start = self.may_start()?;
         if let Some(axis) = self.not_homed() {
             return Err(Refusal::NotHomed { axis });
         }
@@ -677,6 +698,19 @@ impl Controller {
         self.run = self.run.wrapping_add(1);
         self.state = State::Running;
         Ok(())
+    }
+
+    /// When a run could begin, if anything could begin now.
+    fn may_start(&self) -> Result<u64, Refusal> {
+        if self.is_interlocked() {
+            return Err(Refusal::InterlockOpen);
+        }
+        let start = self.now.max(self.out.last()).saturating_add(self.board.start_lead);
+        // The proof begins with nothing owed.
+        match self.out.owed(start) {
+            Some((ticks, led)) => Err(Refusal::Cooling { led, ticks }),
+            None => Ok(start),
+        }
     }
 
     /// An axis that the program moves before it has been homed. Streams are looked at as they come.

@@ -118,6 +118,11 @@ impl Loader {
         Ok(())
     }
 
+    /// A program is being loaded.
+    pub(crate) fn is_staging(&self) -> bool {
+        self.staging.is_some()
+    }
+
     pub(crate) fn begin(&mut self, length: u32) -> Result<(), Refusal> {
         let too_long = Refusal::ProgramTooLong { length, max: MAX_PROGRAM_BYTES as u32 };
         let bytes = usize::try_from(length).map_err(|_| too_long)?;

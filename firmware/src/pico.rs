@@ -69,12 +69,12 @@ pub const fn pin_word(word: u32) -> u32 {
 
 impl Board {
     /// A Raspberry Pi Pico: 4 LEDs (10 ms at most, level settled after 2 ms), 2 cameras, 2 axes of
-    /// ±50 mm at 6400 steps per millimetre, 5 mm/s, 312.5 mm/s², 2 trigger inputs answered after 1 ms.
+    /// ±50 mm at 6400 steps per millimetre, 2.5 mm/s, 312.5 mm/s², 2 trigger inputs answered after 1 ms.
     pub fn pico() -> Self {
         let axis = AxisLimits {
             min: -320_000,
             max: 320_000,
-            max_rate: 32_000,
+            max_rate: 16_000,
             max_acceleration: 2_000_000,
             max_jerk: 1_000_000_000,
             home: None,

@@ -1,6 +1,6 @@
 """The player's PIO programs in an independent emulator (PyPI rp2040-pio-emulator 0.88.0).
 
-    python3 pio_check.py ../../firmware/boards/pico/src/player.rs
+    python3 pio_check.py ../../firmware/boards/pico/src/player.rs ../../firmware/boards/pico/src/inputs.rs
 
 That package has one machine, no background autopull and no STATUS source: the latter is added here, and
 OUT refills at once, which for the player's program comes to the same.
@@ -83,13 +83,17 @@ def interlock(words):
     """The wait itself, with the level at the package's pin 0."""
     for opened in range(3, 60):
         state = State(program_counter=4, y_register=0, pin_values=0b1011)
+
+        def level(clock: int) -> int:
+            return 1 if clock < opened else 0
+
         pins = [
             after.pin_values
             for _, after in emulate(
                 words,
                 stop_when=lambda _, s: s.clock >= 80,
                 initial_state=state,
-                input_source=lambda clock: 1 if clock < opened else 0,
+                input_source=level,
                 wrap_target=5,
                 wrap_top=5,
             )
@@ -124,7 +128,46 @@ def heartbeat(words):
     return "heartbeat: 3 N to 3 N + 6 cycles after it was last fed, latched"
 
 
+def stamping(path):
+    """The program that stamps an input: what it counts is the time, whatever the pin does."""
+    text = open(path).read()
+    table = text[text.index("const PROGRAM"):]
+    table = table[table.index("=") : table.index("];")]
+    words = [int(word, 0) for word in re.findall(r"0x[0-9a-f]+|\b0\b", table)]
+    assert len(words) == 13, words
+    rng, changes = random.Random(9), 0
+    for _ in range(200):
+        at, edges = 0, []
+        for _ in range(rng.randint(1, 8)):
+            at += rng.choice([7, 8, 9, 10, 50, rng.randint(7, 400)])
+            edges.append(at)
+
+        def level(clock: int) -> int:
+            return sum(edge <= clock for edge in edges) % 2
+
+        state = State(x_register=0xFFFFFFFF, receive_fifo=deque())
+        for _, last in emulate(
+            words,
+            stop_when=lambda _, s: s.clock >= at + 30,
+            initial_state=state,
+            input_source=level,
+            jmp_pin=0,
+            wrap_target=0,
+            wrap_top=1,
+        ):
+            pass
+        # The package's FIFO holds four.
+        counts = list(last.receive_fifo)[:4]
+        assert len(counts) == min(len(edges), 4), (edges, counts)
+        for edge, count in zip(edges, counts):
+            seen = 2 * (0xFFFFFFFF - count) - 1
+            assert edge <= seen <= edge + 1, (edges, counts)
+            changes += 1
+    return f"stamping: {changes} changes, each seen within a cycle"
+
+
 if __name__ == "__main__":
     words = programs(sys.argv[1])
     for check in (player, interlock, heartbeat):
         print(check(words))
+    print(stamping(sys.argv[2]))

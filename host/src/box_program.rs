@@ -1,6 +1,7 @@
 //! Where programs for the box come from.
 
 use crate::Error;
+use daic_protocol::limits::MAX_PROGRAM_BYTES;
 use daic_protocol::program::{self, Instruction};
 use daic_rig::compile::compile;
 use daic_rig::experiment::Experiment;
@@ -44,9 +45,10 @@ pub fn read_instructions(path: &Path) -> Result<Vec<Instruction>, Error> {
 /// # Errors
 /// It is too long.
 pub fn encode(instructions: &[Instruction]) -> Result<Vec<u8>, Error> {
-    let bytes = program::encode(instructions).map_err(|e| Error::BoxProgram {
-        path: "the program".into(),
-        reason: format!("{e}; use `daic rig stream`"),
+    let bytes = program::encode(instructions).map_err(|_| {
+        let length: usize = instructions.iter().map(|i| program::encode_instruction(i).len()).sum();
+        let reason = format!("{length} bytes, a box holds {MAX_PROGRAM_BYTES}; use `daic rig stream`");
+        Error::BoxProgram { path: "the program".into(), reason }
     })?;
     Ok(bytes.to_vec())
 }

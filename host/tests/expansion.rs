@@ -11,9 +11,12 @@ use daic_protocol::program::{Condition, Instruction, Timeout, encode};
 use proptest::prelude::*;
 use std::cell::Cell;
 
+/// Word changes of a run, and where the axes stood before it.
+type Played = (Vec<(u64, u32)>, [i32; 6]);
+
 /// What the controller plays from the begin of the run, and where the axes stood before; `None` if it
 /// refuses the program.
-fn played(program: &[Instruction], inputs: &[(u64, u32)]) -> Option<(Vec<(u64, u32)>, [i32; 6])> {
+fn played(program: &[Instruction], inputs: &[(u64, u32)]) -> Option<Played> {
     let mut rig = Rig::new(small_board());
     let bytes = encode(program).ok()?;
     if rig.load_bytes(&bytes) != (Reply::Done { state: State::Loaded }) {

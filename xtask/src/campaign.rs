@@ -155,7 +155,7 @@ pub fn verifier_long(blocks: u64) -> Report {
 }
 
 /// Fuzz targets of `fuzz/`.
-const TARGETS: [&str; 4] = ["framing", "requests", "program", "stream"];
+const TARGETS: [&str; 5] = ["framing", "requests", "program", "stream", "flash"];
 
 /// Each fuzz target for so many seconds; the corpora grow, the totals are kept.
 pub fn fuzz(seconds: u64) -> Report {

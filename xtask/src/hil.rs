@@ -5,6 +5,9 @@ use crate::{datasheet, firmware};
 use std::path::PathBuf;
 use std::process::Command;
 
+/// As pip takes it.
+const PIO_EMULATOR: &str = "rp2040-pio-emulator==0.88.0";
+
 /// Directory of the emulator's sources.
 fn sources() -> PathBuf {
     root().join("hil-sim/emulator")
@@ -53,6 +56,58 @@ fn emulator_tests() -> Outcome {
     }
 }
 
+/// The PIO programs in an emulator that shares no code with the other, from PyPI, in `target/pio-check`.
+fn pio_check() -> Outcome {
+    let place = root().join("target/pio-check");
+    let python = place.join("bin/python");
+    let run = |mut command: Command, what: &str| match command.status() {
+        Ok(status) if status.success() => Ok(()),
+        Ok(status) => Err(format!("{what}: {status}")),
+        Err(error) => Err(format!("{what} did not start: {error}")),
+    };
+    let prepare = || {
+        if place.join(PIO_EMULATOR).exists() {
+            return Ok(());
+        }
+        let mut venv = Command::new("python3");
+        venv.args(["-m", "venv"]).arg(&place);
+        run(venv, "python3 -m venv")?;
+        let mut pip = Command::new(&python);
+        pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", PIO_EMULATOR]);
+        run(pip, "pip")?;
+        std::fs::write(place.join(PIO_EMULATOR), "").map_err(|error| error.to_string())
+    };
+    if let Err(why) = prepare() {
+        return Outcome::NotRun(format!("the second PIO emulator could not be had: {why}"));
+    }
+    let mut check = Command::new(&python);
+    check.arg(sources().join("pio_check.py"));
+    for program in ["player.rs", "inputs.rs"] {
+        check.arg(root().join("firmware/boards/pico/src").join(program));
+    }
+    run(check, "pio_check.py").map_or_else(Outcome::Failed, |()| Outcome::Passed)
+}
+
+/// The image in the emulator with both links on TCP, until it is interrupted.
+pub fn serve() -> Report {
+    let mut report = Report::default();
+    report.step("firmware for the Pico", firmware::build);
+    report.step("emulator of the Pico: packages", install);
+    if report.last_two_passed() {
+        report.step("emulated Pico: `daic rig info tcp://127.0.0.1:PORT`, end with Ctrl-C", || {
+            let mut node = Command::new("node");
+            node.arg(sources().join("main.mjs")).arg(firmware::elf());
+            node.args(["--uart", "0", "--usb", "0"]).env("DAIC_EMULATOR_MODULES", modules());
+            match node.status() {
+                Ok(status) if status.success() => Outcome::Passed,
+                Ok(status) => Outcome::Failed(status.to_string()),
+                Err(error) => Outcome::NotRun(format!("node did not start: {error}")),
+            }
+        });
+    }
+    report
+}
+
 fn cases(arguments: &[&str]) -> Outcome {
     let mut command = cargo(&["run", "--quiet", "--locked", "--package", "daic-tests", "--bin", "hil", "--"]);
     command.args(arguments).arg("--numbers").arg(datasheet::numbers());
@@ -70,6 +125,9 @@ pub fn pico(report: &mut Report, arguments: &[&str]) {
     report.step("emulator of the Pico: packages", install);
     if report.last_two_passed() {
         report.step("emulator of the Pico: its own tests", emulator_tests);
+        if arguments.contains(&"--long") {
+            report.step("PIO programs in a second emulator", pio_check);
+        }
         report.step("hardware in the loop: emulated Pico", || cases(arguments));
         if arguments == ["--target", "pico"] {
             report.step("numbers of docs/datasheet.md", datasheet::check);

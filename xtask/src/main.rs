@@ -20,6 +20,7 @@ cargo xtask COMMAND
   firmware   the Pico's image as ELF and UF2, in target/firmware/
   hil        [--target inprocess|pty|pico] [--port PORT] [--long] [--filter TEXT]: the same cases on the
              controller, on the simulated board, on the emulated Pico, on the board at PORT
+             --serve: the emulated Pico on TCP, for `daic rig` and the like
              --faults N: N more runs of the fault campaign; totals in docs/campaigns/faults.json
              --verifier [--long]: 10 000 (1 000 000 more) random programs through the verifier
   lint       formatting, clippy, documentation without warnings, cargo-deny where installed
@@ -61,6 +62,7 @@ fn main() -> ExitCode {
         }
         ["hil", "--verifier"] => campaign::verifier(),
         ["hil", "--verifier", "--long"] => campaign::verifier_long(100),
+        ["hil", "--serve"] => hil::serve(),
         ["hil", ..] => hil::hil(&words[1..]),
         ["fuzz"] => campaign::fuzz(60),
         ["fuzz", "--long"] => campaign::fuzz(3600),

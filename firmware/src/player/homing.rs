@@ -49,16 +49,17 @@ pub(crate) fn longest(homing: &Homing) -> u64 {
     let travel = u64::from(homing.travel).saturating_add(1);
     let there = travel.saturating_mul(interval(homing.rate));
     let back = travel.saturating_mul(interval(homing.rate_back()));
-    there.saturating_add(back).saturating_add(2 * (DIR_DELAY + DIR_SETUP))
+    // The first word may have to wait for the last step of a move before.
+    there.saturating_add(back).saturating_add(3 * DIR_DELAY + 2 * DIR_SETUP)
 }
 
 /// The shortest: the switch is pressed and lets go at the first step.
 pub(crate) const SHORTEST: u64 = 2 * DIR_SETUP;
 
 impl Search {
-    pub(crate) fn new(tick: u64, axis: u8, homing: Homing) -> Option<Self> {
-        let next = Line::Direction(tick.checked_add(DIR_DELAY)?);
-        Some(Self { axis, homing, back: false, left: homing.travel, next })
+    /// A search whose first word, the direction, comes at `tick`.
+    pub(crate) fn new(tick: u64, axis: u8, homing: Homing) -> Self {
+        Self { axis, homing, back: false, left: homing.travel, next: Line::Direction(tick) }
     }
 
     pub(crate) fn axis(&self) -> u8 {

@@ -15,6 +15,7 @@ use trigger::{Gate, Wait, is_open};
 
 use crate::Sink;
 use crate::board::Board;
+use crate::motion::DIR_DELAY;
 use crate::outputs::{AXES, Outputs};
 use crate::stream::{Fetched, Source};
 use daic_protocol::channels::{self, AXIS_MASK, LED_MASK, LIMIT_MASK};
@@ -122,6 +123,8 @@ pub(crate) struct Player {
     motion: Option<Motion>,
     gate: Gate,
     policy: Policy,
+    /// Since when that is the policy.
+    policy_since: u64,
     /// Ticks that the board needs to act on an input.
     latency: u64,
     /// Ticks spent waiting beyond the shortest time the program can take.
@@ -149,6 +152,7 @@ impl Player {
             motion: None,
             gate: None,
             policy: Policy::DEFAULT,
+            policy_since: start,
             latency: latency as u64,
             waited: 0,
             host_lost: false,
@@ -223,7 +227,9 @@ impl Player {
         if self.host_lost || self.policy.host_timeout_ms == 0 || self.policy.host_loss == Reaction::Continue {
             return None;
         }
-        Some(host.saturating_add(u64::from(self.policy.host_timeout_ms).saturating_mul(TICKS_PER_MS)))
+        let silence = u64::from(self.policy.host_timeout_ms).saturating_mul(TICKS_PER_MS);
+        // Silence from before counts, but nothing can be done about it before there is a policy.
+        Some(host.saturating_add(silence).max(self.policy_since))
     }
 
     /// What the program wants; inputs are known up to tick `known`.
@@ -312,7 +318,7 @@ impl Player {
         }
         match self.current {
             Current::None if self.stopping.is_none() && self.parts.is_empty() && self.now <= until => {
-                if self.motion.as_ref().is_some_and(|m| m.due().is_some()) {
+                if self.is_moving() {
                     return None;
                 }
                 let Fetched::Instruction(Instruction::Edge { mask, value, after }, length) =
@@ -370,17 +376,25 @@ impl Player {
         reaction: Reaction,
         stage: &mut Stage<'_>,
     ) -> Progress {
-        let moving = self.motion.as_ref().is_some_and(|m| m.due().is_some());
-        if reaction == Reaction::FinishMove && moving {
-            let dark = stage.out.word & AXIS_MASK;
-            if dark != stage.out.word {
-                let tick = stage.out.earliest(tick);
-                stage.out.put(tick, dark, stage.sink);
-            }
-            self.current = Current::Fail(cause);
+        if reaction == Reaction::FinishMove && self.is_moving() {
+            self.finish_moving(tick, Current::Fail(cause), stage);
             return Progress::Waiting;
         }
         Progress::Failed(cause, tick)
+    }
+
+    fn is_moving(&self) -> bool {
+        self.motion.as_ref().is_some_and(|m| m.due().is_some())
+    }
+
+    /// Nothing is played any more from `tick` on but the move under way: all other lines go low at once.
+    fn finish_moving(&mut self, tick: u64, then: Current, stage: &mut Stage<'_>) {
+        let dark = stage.out.word & AXIS_MASK;
+        if self.is_moving() && dark != stage.out.word {
+            let tick = stage.out.earliest(tick);
+            stage.out.put(tick, dark, stage.sink);
+        }
+        self.current = then;
     }
 
     /// When the host's silence counts, if it was last heard at tick `host`.
@@ -452,7 +466,7 @@ impl Player {
                 if let Some(part) = self.parts.pop_front() {
                     self.begin(tick, part, known, stage)?;
                 } else if self.stopping.is_some_and(|from| tick >= from) {
-                    self.current = Current::End;
+                    self.finish_moving(tick, Current::End, stage);
                 } else {
                     return self.read(tick, known, source, stage);
                 }
@@ -467,7 +481,11 @@ impl Player {
                 let mut word = (stage.out.word & !mask) | (value & mask);
                 // A step that would come too close before it comes with it.
                 if self.step_due(stage.out).is_some_and(|t| t <= tick) {
-                    word = self.motion.as_mut()?.advance(word, stage.out)?;
+                    let motion = self.motion.as_mut()?;
+                    if let Some(axis) = motion.blocked(stage.out).filter(|_| !stage.blind) {
+                        return Some(Progress::Failed(FaultCause::LimitSwitch { axis }, tick));
+                    }
+                    word = motion.advance(word, stage.out)?;
                 }
                 stage.out.put(tick, word, stage.sink);
                 self.finish(tick);
@@ -481,7 +499,11 @@ impl Player {
             Current::Trigger(wait) => return self.triggered(tick, wait, stage),
             Current::Home(mut search) => match search.advance(tick, stage.out, stage.sink)? {
                 Found::Searching => self.current = Current::Home(search),
-                Found::Home(tick) => self.finish(tick),
+                Found::Home(tick) => {
+                    let beyond = tick.saturating_sub(self.now).saturating_sub(SHORTEST_HOMING);
+                    self.waited = self.waited.saturating_add(beyond);
+                    self.finish(tick);
+                }
                 Found::Failed(cause) => return Some(Progress::Failed(cause, tick)),
             },
             Current::Begin(instruction) => {
@@ -517,8 +539,8 @@ impl Player {
             }
             Timeout::Continue => self.current = Current::Wait(end, false),
             Timeout::Stop => {
-                self.now = end;
-                self.current = Current::End;
+                self.current = Current::Wait(end, false);
+                self.stopping.get_or_insert(end);
             }
         }
         Some(Progress::Waiting)
@@ -535,7 +557,7 @@ impl Player {
         let (instruction, length) = match source.fetch(self.offset) {
             Fetched::Instruction(instruction, length) => (instruction, length),
             Fetched::End => {
-                self.current = Current::End;
+                self.finish_moving(tick, Current::End, stage);
                 return Some(Progress::Waiting);
             }
             Fetched::Dry => {
@@ -612,7 +634,7 @@ impl Player {
             }
             Instruction::Gate { input, open_high } => self.gate = Some((input, open_high)),
             Instruction::NoGate => self.gate = None,
-            Instruction::Policy(policy) => self.policy = policy,
+            Instruction::Policy(policy) => (self.policy, self.policy_since) = (policy, tick),
             Instruction::Join { axis, target } => self.joined.push((axis, target)).ok()?,
             Instruction::Move { axis, target, max_rate, acceleration, jerk } => {
                 let pace = Pace { rate: max_rate, acceleration, jerk };
@@ -630,14 +652,16 @@ impl Player {
                 self.current = Current::Reach(end);
             }
             Instruction::Home { axis } => {
-                if self.motion.as_ref().is_some_and(|m| m.due().is_some()) {
+                if self.is_moving() {
                     self.now = tick;
                     self.current = Current::Begin(instruction);
                     return Some(());
                 }
                 stage.out.set_homed(axis, false);
                 let homing = stage.board.axes.get(usize::from(axis))?.home?;
-                self.current = Current::Home(Search::new(tick, axis, homing)?);
+                self.now = tick;
+                let direction = stage.out.earliest(tick.checked_add(DIR_DELAY)?);
+                self.current = Current::Home(Search::new(direction, axis, homing));
             }
             Instruction::Capture { axis, target, max_rate, acceleration, jerk, settle, .. } => {
                 self.now = tick;
@@ -661,7 +685,7 @@ impl Player {
         instruction: Instruction,
         stage: &mut Stage<'_>,
     ) -> Option<Option<u64>> {
-        if self.motion.as_ref().is_some_and(|m| m.due().is_some()) {
+        if self.is_moving() {
             self.now = tick;
             self.current = Current::Begin(instruction);
             return Some(None);

@@ -1,7 +1,7 @@
 //! Playing a program out, up to a limit, to find what it really does.
 
 use super::checker::{Checker, Choice, Range};
-use super::violation;
+use super::{MAX_RUN_TICKS, violation};
 use crate::board::Board;
 use crate::outputs::AXES;
 use daic_protocol::limits::MAX_LOOP_DEPTH;
@@ -10,6 +10,9 @@ use daic_protocol::program::{Instruction, decode_instruction};
 
 /// Most instructions that are played out, every pass of every loop counted.
 pub const MAX_PLAYED: u32 = 20_000;
+
+/// What planning an S-curve costs in instructions, so that a program of nothing else is not played out for minutes.
+const S_CURVE: u32 = 100;
 
 /// What playing out has shown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -30,6 +33,18 @@ struct Pass {
     left: u32,
     /// Time at its begin.
     since: u64,
+}
+
+/// What planning the move of an instruction costs, in instructions.
+fn plans(instruction: &Instruction) -> u32 {
+    match instruction {
+        Instruction::Move { jerk, .. } | Instruction::Go { jerk, .. } | Instruction::Capture { jerk, .. }
+            if *jerk > 0 =>
+        {
+            S_CURVE
+        }
+        _ => 0,
+    }
 }
 
 /// Plays a program of sound structure with the axes at `position` and every wait at one end of its span.
@@ -56,7 +71,8 @@ pub(super) fn play_out(program: &[u8], board: &Board, choice: Choice, position: 
             }
             Instruction::LoopEnd => {
                 let Some(pass) = loops.last_mut() else { return Outcome::TooLarge };
-                if checker.elapsed().0 == pass.since {
+                // Behind a wait without end time cannot be counted any more.
+                if checker.elapsed().0 == pass.since && pass.since < MAX_RUN_TICKS {
                     return Outcome::Broken(violation(pass.begin, Rule::EmptyLoop, 0, 1));
                 }
                 pass.since = checker.elapsed().0;
@@ -69,6 +85,7 @@ pub(super) fn play_out(program: &[u8], board: &Board, choice: Choice, position: 
             }
             Instruction::Stop => break,
             other => {
+                played = played.saturating_add(plans(&other));
                 if let Err(violation) = checker.take(index, &other, board) {
                     return Outcome::Broken(violation);
                 }

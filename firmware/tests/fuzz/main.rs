@@ -68,3 +68,8 @@ fn program() {
 fn stream() {
     run("stream", targets::stream, 300);
 }
+
+#[test]
+fn flash() {
+    run("flash", targets::flash, 300);
+}

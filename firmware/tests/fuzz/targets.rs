@@ -1,5 +1,6 @@
 //! What must hold for any bytes. Used by the targets in `fuzz/` and by the plain test beside this file.
 
+use daic_firmware::slots::{Flash, PAGE, SECTOR, Slots, size};
 use daic_firmware::verifier::verify;
 use daic_firmware::{Board, Controller, Sink};
 use daic_protocol::channels::{INTERLOCK, TRIGGER_INPUT_MASK};
@@ -204,4 +205,49 @@ pub fn stream(data: &[u8]) {
     if controller.state() == State::Faulted {
         assert_eq!(controller.word(), 0);
     }
+}
+
+/// Two slots of flash.
+#[derive(Clone)]
+struct Image(Vec<u8>);
+
+impl Flash for Image {
+    fn read(&self, offset: u32, into: &mut [u8]) {
+        into.copy_from_slice(&self.0[offset as usize..][..into.len()]);
+    }
+    fn erase(&mut self, offset: u32) {
+        self.0[offset as usize..][..SECTOR as usize].fill(0xff);
+    }
+    fn program(&mut self, offset: u32, page: &[u8; PAGE]) {
+        self.0[offset as usize..].iter_mut().zip(page).for_each(|(to, from)| *to &= from);
+    }
+}
+
+/// Flash in which bytes have changed since it was written: 4 bytes each, an offset and what stands there. What is
+/// found in a slot is whole, and the slot can be written again; the other keeps what it has.
+pub fn flash(data: &[u8]) {
+    let mut slots = Slots::new(Image(vec![0xff; size(2) as usize]), 2);
+    let long: Vec<u8> = (0..600u32).map(|i| (i * 7) as u8).collect();
+    for (slot, bytes) in [(0, &long[..]), (0, &long[..300]), (1, &long[..40]), (1, &[])] {
+        slots.store(slot, bytes, [slot, 0, 0, 0]).expect("good flash");
+    }
+    for change in data.chunks_exact(4) {
+        let offset = u32::from_le_bytes([change[0], change[1], change[2], 0]) % size(2);
+        slots.flash().0[offset as usize] = change[3];
+    }
+    let mut loaded = program::ProgramBytes::new();
+    let held = |slots: &Slots<Image>, slot: u8, loaded: &mut program::ProgramBytes| {
+        let stored = slots.load(slot, loaded).ok()?;
+        assert_eq!(program::hash(loaded), stored.hash);
+        assert_eq!(loaded.len(), stored.length as usize);
+        Some(stored)
+    };
+    let (first, second) = (held(&slots, 0, &mut loaded), held(&slots, 1, &mut loaded));
+    assert_eq!(slots.list().len(), usize::from(first.is_some()) + usize::from(second.is_some()));
+    slots.store(0, &long[..77], [9; 4]).expect("good flash");
+    assert_eq!(held(&slots, 1, &mut loaded), second);
+    assert!(held(&slots, 0, &mut loaded).is_some_and(|stored| stored.tag == [9; 4]));
+    assert_eq!(loaded, long[..77]);
+    slots.erase(0).expect("good flash");
+    assert_eq!((held(&slots, 0, &mut loaded), held(&slots, 1, &mut loaded)), (None, second));
 }

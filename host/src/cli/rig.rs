@@ -10,7 +10,7 @@ use daic::recording::event_record;
 use daic::{Error, Progress as _, stage, timeline};
 use daic_dataset::{Existing, atomic};
 use daic_protocol::limits::TICK_HZ;
-use daic_protocol::message::{Autostart, Event, EventKind, SelfTests, State};
+use daic_protocol::message::{Autostart, Event, EventKind, SelfTests, State, Status};
 use daic_protocol::program::Instruction;
 use daic_rig::RigError;
 use daic_rig::experiment::Experiment;
@@ -410,9 +410,7 @@ fn info(link: &mut Link) -> Result<Answer, Error> {
 fn play_loaded(link: &mut Link, output: &Output) -> Result<Vec<Event>, Error> {
     let status = rig(link.status())?;
     let Some(hash) = status.program else { return Err(RigError::NotReady { state: status.state }.into()) };
-    if status.state == State::Faulted {
-        rig(link.clear_fault())?;
-    }
+    clear_fault(link, &status, output)?;
     rig(link.arm(hash))?;
     output.stop_on_interrupt();
     output.stage("playing", 0);
@@ -420,8 +418,24 @@ fn play_loaded(link: &mut Link, output: &Output) -> Result<Vec<Event>, Error> {
     follow(link, status.next_event, output, &mut |_| Ok(()))
 }
 
-/// Reads events until the run ends; `each` is called between two looks.
+/// Reads events until the run ends; `each` is called between two looks. A box that cannot be followed any more is not
+/// left playing.
 fn follow(
+    link: &mut Link,
+    from: u32,
+    output: &Output,
+    each: &mut dyn FnMut(&mut Link) -> Result<(), Error>,
+) -> Result<Vec<Event>, Error> {
+    let followed = follow_on(link, from, output, each);
+    if followed.as_ref().is_err_and(|e| !matches!(e, Error::Rig(RigError::BoxFaulted { .. })))
+        && let Err(error) = link.abort()
+    {
+        output.note(&format!("the box could not be told to stop: {error}"));
+    }
+    followed
+}
+
+fn follow_on(
     link: &mut Link,
     from: u32,
     output: &Output,
@@ -429,7 +443,7 @@ fn follow(
 ) -> Result<Vec<Event>, Error> {
     let mut reader = EventReader::new(from);
     let mut events = Vec::new();
-    let mut stopped = false;
+    let (mut stopped, mut refused) = (false, None);
     loop {
         let before = events.len();
         rig(reader.poll(link, &mut events))?;
@@ -442,13 +456,32 @@ fn follow(
                 _ => {}
             }
         }
+        if let Some(refused) = refused {
+            return Err(refused);
+        }
         if output.stop_requested().load(Ordering::Relaxed) && !stopped {
             rig(link.stop())?;
             stopped = true;
         }
-        each(link)?;
+        // A run that has just ended takes nothing any more; its last event says why.
+        refused = each(link).err();
         std::thread::sleep(POLL);
     }
+}
+
+/// Makes a box that has faulted before ready again, and says what of.
+fn clear_fault(link: &mut Link, status: &Status, output: &Output) -> Result<(), Error> {
+    if status.state == State::Faulted {
+        rig(link.clear_fault())?;
+        if let Some(fault) = status.fault {
+            let (cause, tick) = (fault.cause, fault.tick);
+            output.note(&format!(
+                "cleared the fault {cause:?} of tick {tick}, instruction {}",
+                fault.instruction
+            ));
+        }
+    }
+    Ok(())
 }
 
 fn stream(link: &mut Link, path: &std::path::Path, output: &Output) -> Result<Answer, Error> {
@@ -456,9 +489,7 @@ fn stream(link: &mut Link, path: &std::path::Path, output: &Output) -> Result<An
     // the box takes no loops in streams
     let count = Unrolled::count(&instructions);
     let status = rig(link.status())?;
-    if status.state == State::Faulted {
-        rig(link.clear_fault())?;
-    }
+    clear_fault(link, &status, output)?;
     output.stop_on_interrupt();
     output.stage("streaming", count);
     let mut sender = rig(StreamSender::begin(link, Unrolled::new(&instructions)))?;

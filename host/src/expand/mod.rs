@@ -24,12 +24,16 @@ const SPACING: u64 = MIN_STEP_TICKS as u64;
 
 /// Longest program that is expanded, in words: beyond it nothing is drawn or compared.
 pub const MAX_EDGES: usize = 50_000_000;
+/// Most instructions that are gone through, every pass of every loop counted.
+const MAX_INSTRUCTIONS: u64 = 1_000_000_000;
 
 /// A program that cannot be expanded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum ExpandError {
-    /// More edges than [`MAX_EDGES`].
-    #[error("instruction {instruction}: the program puts out more than {MAX_EDGES} edges")]
+    /// More edges than [`MAX_EDGES`], or more passes of loops than anybody waits for.
+    #[error(
+        "instruction {instruction}: the program puts out more than {MAX_EDGES} edges, or plays more than {MAX_INSTRUCTIONS} instructions"
+    )]
     TooLong {
         /// Where the limit was passed.
         instruction: usize,
@@ -158,9 +162,11 @@ impl Expansion<'_> {
             }
             Answer::TimedOut => {
                 self.now = self.now.saturating_add(u64::from(timeout));
-                if on_timeout == Timeout::Continue {
-                    self.now = self.now.saturating_add(u64::from(delay));
+                if on_timeout == Timeout::Fault {
+                    self.steps.retain(|step| step.tick < self.now);
+                    return Some(false);
                 }
+                self.now = self.now.saturating_add(u64::from(delay));
                 on_timeout == Timeout::Continue
             }
         })
@@ -237,8 +243,9 @@ pub fn expand_with(
         waited: 0,
     };
     let mut loops: Vec<(usize, u32)> = Vec::new();
-    let mut at = 0;
+    let (mut at, mut played) = (0, 0u64);
     while let Some(&instruction) = program.get(at) {
+        played += 1;
         let invalid = ExpandError::Invalid { instruction: at };
         match instruction {
             Instruction::Edge { mask, value, after } => state.edge(mask, value, after),
@@ -297,6 +304,13 @@ pub fn expand_with(
                 let on = "a trigger";
                 let unknown = ExpandError::DependsOnInput { instruction: at, on };
                 if !state.wait(delay, timeout, on_timeout).ok_or(unknown)? {
+                    if on_timeout == Timeout::Stop
+                        && let Some(end) = state.going
+                    {
+                        // the move is finished in the dark
+                        state.words.push(Change { tick: state.now, mask: !channels::AXIS_MASK, value: 0 });
+                        state.now = state.now.max(end);
+                    }
                     break;
                 }
             }
@@ -315,7 +329,7 @@ pub fn expand_with(
             | Instruction::Policy(_) => {}
             Instruction::Stop => break,
         }
-        if state.words.len() + state.steps.len() > MAX_EDGES {
+        if state.words.len() + state.steps.len() > MAX_EDGES || played > MAX_INSTRUCTIONS {
             return Err(ExpandError::TooLong { instruction: at });
         }
         at += 1;

@@ -34,6 +34,10 @@ pub trait Target {
     fn bench(&mut self) -> Option<&mut dyn Bench>;
     /// A fresh board.
     fn restart(&mut self);
+    /// Time stands still while a stream has nothing to play.
+    fn waits_for_streams(&self) -> bool {
+        false
+    }
 }
 
 /// What can be done to a board from outside. Times are ticks of the recorder.

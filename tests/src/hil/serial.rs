@@ -98,6 +98,10 @@ impl Target for Serial {
         None
     }
 
+    fn waits_for_streams(&self) -> bool {
+        self.rig.is_some()
+    }
+
     fn restart(&mut self) {
         if self.rig.is_some()
             && let Ok((rig, port)) = simulate()

@@ -364,7 +364,7 @@ fn the_microscope_template_is_valid_and_needs_no_optics() {
     assert!(error.contains("scope.toml") && error.contains("microscope"), "{error}");
     let both = format!("{}\n{text}", "[optics]\nwavelength = \"633 nm\"\npinhole_to_grating = \"307 mm\"\ngrating_to_reference = \"109 mm\"\nfocal = \"17000 px\"\nprincipal_point = [\"1 px\", \"1 px\"]\ngrating = { lines = \"300 /mm\" }\n").replacen("seed = 1\n", "", 1);
     for (text, words) in [
-        (both, "one of [optics] and [microscope]"),
+        (both, "one of [optics], [microscope] and [lightfield]"),
         (text.replace("[microscope]", "[other]"), "other"),
         (text.replace("\"40 px\"", "\"0 px\""), "microscope.search"),
     ] {

@@ -154,8 +154,10 @@ pub(super) fn limit(host: &mut Host, _: bool) -> Result<Outcome, String> {
     let position = host.status()?.position[0];
     check(position == -(steps as i32), || format!("{steps} steps came out, the count is {position}"))?;
     let late = safe.0.saturating_sub(pressed);
-    check(late < u64::from(1000 * US), || format!("safe {late} ticks after the switch"))?;
-    Ok(Outcome::Passed(vec![("pressed to safe", late as f64, "ticks")]))
+    // A turn of the main loop and the answer; the moment decides how much of it.
+    let most = u64::from(1000 * US);
+    check(late < most, || format!("safe {late} ticks after the switch"))?;
+    Ok(Outcome::Passed(vec![("pressed to safe, less than", most as f64, "ticks")]))
 }
 
 /// The policy for a host that says nothing: an exact beginning of the program, then safe.
@@ -177,9 +179,10 @@ pub(super) fn silence(host: &mut Host, _: bool) -> Result<Outcome, String> {
     prefix(&program, &edges, origin)?;
     let late = edges.last().map_or(0, |e| e.0).saturating_sub(heard);
     // 15 ms, and what the player has been given: 20 ms and a block.
-    check(late <= u64::from(40_000 * US), || format!("safe {late} ticks after the last request"))?;
+    let most = u64::from(40_000 * US);
+    check(late < most, || format!("safe {late} ticks after the last request"))?;
     let told = ran.fault.map_or(0, |f| f.tick) as i64 - ran.start as i64;
     let safe = edges.last().map_or(0, |e| e.0) as i64 - origin;
     check(told >= safe && told - safe <= i64::from(500 * US), || format!("safe at {safe}, told {told}"))?;
-    Ok(Outcome::Passed(vec![("last request to safe", late as f64, "ticks")]))
+    Ok(Outcome::Passed(vec![("last request to safe, less than", most as f64, "ticks")]))
 }

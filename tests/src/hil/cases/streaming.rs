@@ -69,14 +69,14 @@ impl Sender {
     }
 }
 
-/// 10 000 edges at 5 000 a second, every one of them told and read; more than the box can hold.
+/// 10 000 edges at 3 125 a second, every one of them told and read; more than the box can hold.
 pub(super) fn edges(host: &mut Host, long: bool) -> Result<Outcome, String> {
     let pairs = if long { 50_000 } else { 5_000 };
     let mut program = Vec::new();
     for n in 0..pairs {
         let mask = if n % 7 == 0 { lamp(1) } else { 1 << 12 };
         let jitter = (n * 7919) % 5000;
-        program.extend([set(mask, 25_000 + jitter), clear(mask, 25_000 - jitter)]);
+        program.extend([set(mask, 40_000 + jitter), clear(mask, 40_000 - jitter)]);
     }
     let mut sender = Sender::new(host, &program)?;
     while sender.state.limit as usize > sender.sent && sender.sent < 12_000 {
@@ -107,7 +107,7 @@ pub(super) fn edges(host: &mut Host, long: bool) -> Result<Outcome, String> {
     host.compare(&program, &ran)?;
     Ok(Outcome::Passed(vec![
         ("edges", ran.edges.len() as f64, ""),
-        ("edges per second", 5000.0, ""),
+        ("edges per second", 3125.0, ""),
         ("edge error", 0.0, "ticks"),
         ("least lead of the stream", lead.unwrap_or(0) as f64, "ticks"),
     ]))
@@ -115,6 +115,9 @@ pub(super) fn edges(host: &mut Host, long: bool) -> Result<Outcome, String> {
 
 /// What has come is played to its end, and the box says where it ran dry.
 pub(super) fn dry(host: &mut Host, _: bool) -> Result<Outcome, String> {
+    if host.target.waits_for_streams() {
+        return Ok(Outcome::Cannot("its clock waits for the stream"));
+    }
     let mut program = vec![];
     for _ in 0..60 {
         program.extend([set(lamp(1), 300 * US), clear(lamp(1), 40 * US)]);

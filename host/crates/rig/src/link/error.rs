@@ -1,7 +1,7 @@
 //! What can go wrong between host and box.
 
 use daic_protocol::limits::TICK_HZ;
-use daic_protocol::message::{Refusal, SlotError, State};
+use daic_protocol::message::{Refusal, Rule, SlotError, State};
 use std::fmt;
 use std::io;
 use thiserror::Error;
@@ -38,6 +38,18 @@ pub enum LinkError {
     PortBusy {
         /// The port.
         path: String,
+    },
+    /// A box that says it has more than any box can have.
+    #[error(
+        "the box says that it has {found} {what}, a box has at most {max}; its firmware is damaged or not ours"
+    )]
+    BadHello {
+        /// Of what.
+        what: &'static str,
+        /// What it says.
+        found: u8,
+        /// Most that the protocol knows.
+        max: u8,
     },
     /// The system does not open the port.
     #[error("cannot open port {path}: {reason}; check that it is a serial port and that you may use it")]
@@ -202,6 +214,7 @@ impl LinkError {
             | Self::NotOurs { .. }
             | Self::OtherVersion { .. }
             | Self::OtherSchema { .. }
+            | Self::BadHello { .. }
             | Self::TooLarge { .. }
             | Self::ProgramTooLong { .. } => Outcome::NotSent,
         }
@@ -261,6 +274,15 @@ impl fmt::Display for Refused<'_> {
             }
             Refusal::HashDiffers { computed, given } => {
                 write!(f, "the program's hash is {computed:#010x}, not {given:#010x}")
+            }
+            Refusal::Invalid(v) if v.rule == Rule::CannotProve => {
+                let rule = u8::try_from(v.value).ok().and_then(|n| postcard::from_bytes::<Rule>(&[n]).ok());
+                let rule = rule.map_or_else(|| format!("rule {}", v.value), |rule| format!("{rule:?}"));
+                write!(
+                    f,
+                    "at instruction {} the box cannot prove that the rule {rule} holds: it depends on inputs or on where the stage stands, and the program is too long to be played out ({} instructions); shorten loops, give waits a time-out, or begin with a move",
+                    v.instruction, v.limit
+                )
             }
             Refusal::Invalid(v) => write!(
                 f,

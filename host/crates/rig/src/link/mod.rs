@@ -19,6 +19,7 @@ pub use transport::{MAX_WRITE, PipeEnd, StreamTransport, Transport, available_po
 pub use unroll::Unrolled;
 
 use crate::clock::ClockSample;
+use daic_protocol::channels;
 use daic_protocol::frame::{self, Decoder, Fed};
 use daic_protocol::limits::{CHUNK_LEN, PROTOCOL_VERSION};
 use daic_protocol::message::{
@@ -153,6 +154,15 @@ impl Link {
         if hello.schema != SCHEMA_HASH {
             return Err(LinkError::OtherSchema { theirs: hello.schema, ours: SCHEMA_HASH });
         }
+        let counts = [
+            ("LEDs", hello.leds, channels::LEDS),
+            ("cameras", hello.cameras, channels::CAMERAS),
+            ("axes", hello.axes, channels::AXES),
+            ("inputs", hello.inputs, channels::INPUTS),
+        ];
+        if let Some(&(what, found, max)) = counts.iter().find(|(_, found, max)| found > max) {
+            return Err(LinkError::BadHello { what, found, max });
+        }
         link.hello = hello;
         Ok(link)
     }
@@ -189,7 +199,13 @@ impl Link {
         // or it was silent while it booted.
         let suspicious = exchange.attempts > 1 || matches!(exchange.reply, Reply::Refused(_));
         if suspicious && !matches!(request, Request::Hello | Request::Status) {
-            self.verify_boot()?;
+            self.verify_boot().map_err(|error| match error {
+                // What could not be sent is the question after it; the request itself was.
+                LinkError::Disconnected { port, source, .. } => {
+                    LinkError::Disconnected { port, request: name(request), sent: true, source }
+                }
+                other => other,
+            })?;
         }
         match exchange.reply {
             Reply::Refused(refusal) => Err(LinkError::Refused { request: name(request), refusal }),
