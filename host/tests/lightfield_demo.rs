@@ -16,5 +16,5 @@ fn beads_come_back_where_they_were_moved_to() {
         assert!(check.passed, "{check:?}");
     }
     assert!(summary.passed && summary.beads.len() == 12);
-    assert!(out.join("report.html").is_file() && out.join("results/lightfield/rest.tif").is_file());
+    assert!(out.join("report.html").is_file() && out.join("results/lightfield/000002.tif").is_file());
 }
