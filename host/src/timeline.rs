@@ -145,7 +145,7 @@ pub fn svg(traces: &[(&str, &str, &Words)], spans: &[(u64, u64)]) -> String {
     let height = 40.0 + LANE_HEIGHT * lanes.len() as f64;
     let mut out = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {} {height}\" font-family=\"sans-serif\" font-size=\"11\">\n",
-        LABEL_WIDTH + WIDTH + 10.0
+        LABEL_WIDTH + WIDTH + 30.0
     );
     for &(begin, finish) in spans.iter().take(DRAWN_MAX) {
         let width = (x(finish) - x(begin)).max(1.0);
