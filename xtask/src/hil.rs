@@ -94,7 +94,7 @@ pub fn serve() -> Report {
     report.step("firmware for the Pico", firmware::build);
     report.step("emulator of the Pico: packages", install);
     if report.last_two_passed() {
-        report.step("emulated Pico: `daic rig info tcp://127.0.0.1:PORT`, end with Ctrl-C", || {
+        report.step("emulated Pico: `daic rig --port tcp://127.0.0.1:PORT info`, end with Ctrl-C", || {
             let mut node = Command::new("node");
             node.arg(sources().join("main.mjs")).arg(firmware::elf());
             node.args(["--uart", "0", "--usb", "0"]).env("DAIC_EMULATOR_MODULES", modules());
