@@ -176,10 +176,12 @@ pub fn fuzz(seconds: u64) -> Report {
 }
 
 fn fuzz_target(target: &str, seconds: u64, totals: &Path) -> Result<(), String> {
+    // What is found goes beside the seeds, which the tests go through one by one, and is kept for the next call.
+    let (grown, seeds) = (format!("grown/{target}"), format!("corpus/{target}"));
+    std::fs::create_dir_all(root().join("fuzz").join(&grown)).map_err(|e| format!("{grown}: {e}"))?;
     let mut command = Command::new("cargo");
-    command
-        .args(["+nightly", "fuzz", "run", "--fuzz-dir", ".", target, "--"])
-        .current_dir(root().join("fuzz"));
+    command.args(["+nightly", "fuzz", "run", "--fuzz-dir", ".", target, &grown, &seeds, "--"]);
+    command.current_dir(root().join("fuzz"));
     command.arg(format!("-max_total_time={seconds}")).arg("-print_final_stats=1").arg("-timeout=20");
     let output = command.output().map_err(|e| format!("cargo did not start: {e}"))?;
     let text = String::from_utf8_lossy(&output.stderr);
