@@ -5,7 +5,7 @@ use super::{lines, outcome, replace_section};
 use crate::steps::{Outcome, Report, root};
 use serde_json::Value;
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::Command;
 
 /// Version compared with.
@@ -26,31 +26,7 @@ fn folder() -> PathBuf {
 
 /// Python with pyolaf, made at the first call.
 fn environment() -> Result<PathBuf, String> {
-    let dir = folder().join(format!("pyolaf-{PYOLAF}"));
-    let python = dir.join(if cfg!(windows) { "Scripts/python.exe" } else { "bin/python" });
-    let works = |python: &Path| {
-        Command::new(python)
-            .args(["-c", "import pyolaf.lf, pyolaf.project"])
-            .output()
-            .is_ok_and(|o| o.status.success())
-    };
-    if works(&python) {
-        return Ok(python);
-    }
-    println!("making {}", dir.display());
-    let run = |command: &mut Command| match command.status() {
-        Ok(status) if status.success() => Ok(()),
-        Ok(status) => Err(format!("{command:?}: {status}")),
-        Err(error) => Err(format!("{command:?} did not start: {error}")),
-    };
-    run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&dir))?;
-    let package = format!("pyolaf=={PYOLAF}");
-    run(Command::new(&python).args(["-m", "pip", "install", "--quiet"]).args(WITH).arg(&package))?;
-    if works(&python) {
-        Ok(python)
-    } else {
-        Err(format!("pyolaf {PYOLAF} was installed but cannot be imported"))
-    }
+    super::environment(&folder(), "pyolaf", PYOLAF, &WITH, "import pyolaf.lf, pyolaf.project")
 }
 
 /// The whole benchmark.

@@ -70,6 +70,37 @@ fn lines(command: &mut Command) -> Result<Vec<Value>, String> {
         .collect()
 }
 
+/// Python of an environment in `folder` that holds one version of a package and what it needs `with`; made where
+/// `import` does not work there.
+fn environment(
+    folder: &Path,
+    package: &str,
+    version: &str,
+    with: &[&str],
+    import: &str,
+) -> Result<PathBuf, String> {
+    let dir = folder.join(format!("{package}-{version}"));
+    let python = dir.join(if cfg!(windows) { "Scripts/python.exe" } else { "bin/python" });
+    let works = || Command::new(&python).args(["-c", import]).output().is_ok_and(|o| o.status.success());
+    if works() {
+        return Ok(python);
+    }
+    println!("making {}", dir.display());
+    let run = |command: &mut Command| match command.status() {
+        Ok(status) if status.success() => Ok(()),
+        Ok(status) => Err(format!("{command:?}: {status}")),
+        Err(error) => Err(format!("{command:?} did not start: {error}")),
+    };
+    run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&dir))?;
+    let wanted = format!("{package}=={version}");
+    run(Command::new(&python).args(["-m", "pip", "install", "--quiet"]).args(with).arg(&wanted))?;
+    if works() {
+        Ok(python)
+    } else {
+        Err(format!("{package} {version} was installed but cannot be imported"))
+    }
+}
+
 /// Folder with the golden images, where it is there.
 fn golden() -> Option<PathBuf> {
     let shared = std::env::var_os("DAIC_SHARED").map_or_else(|| root().join("../shared"), PathBuf::from);

@@ -23,29 +23,8 @@ pub struct Result {
 
 /// Python with pyvale; made at the first call. The error says what was missing.
 pub fn environment() -> std::result::Result<PathBuf, String> {
-    let dir = folder().join(format!("pyvale-{VERSION}"));
-    let python = dir.join(if cfg!(windows) { "Scripts/python.exe" } else { "bin/python" });
-    let works = |python: &Path| {
-        let import = format!("import pyvale; assert pyvale.__version__ == '{VERSION}'");
-        Command::new(python).args(["-c", &import]).output().is_ok_and(|o| o.status.success())
-    };
-    if works(&python) {
-        return Ok(python);
-    }
-    println!("making {}", dir.display());
-    let run = |command: &mut Command| match command.status() {
-        Ok(status) if status.success() => Ok(()),
-        Ok(status) => Err(format!("{command:?}: {status}")),
-        Err(error) => Err(format!("{command:?} did not start: {error}")),
-    };
-    run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&dir))?;
-    let package = format!("pyvale=={VERSION}");
-    run(Command::new(&python).args(["-m", "pip", "install", "--quiet", &package]))?;
-    if works(&python) {
-        Ok(python)
-    } else {
-        Err(format!("pyvale {VERSION} was installed but cannot be imported"))
-    }
+    let import = format!("import pyvale; assert pyvale.__version__ == '{VERSION}'");
+    super::environment(&folder(), "pyvale", VERSION, &[], &import)
 }
 
 /// One process, `repeats` runs in it.

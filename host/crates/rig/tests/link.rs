@@ -380,8 +380,8 @@ fn survives(port: &str, line: Box<dyn Transport>, pull: &AtomicBool) {
     assert!(stats.reconnects >= 5, "{stats:?}");
 }
 
-#[test]
-fn a_line_that_is_pulled_out_loses_no_event() {
+/// A TCP port whose line can be pulled out: its name, the box's side, what pulls.
+fn loose_tcp() -> (String, Box<dyn Transport>, Arc<AtomicBool>) {
     let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("bind");
     let address = listener.local_addr().expect("address");
     listener.set_nonblocking(true).expect("nonblocking");
@@ -391,7 +391,14 @@ fn a_line_that_is_pulled_out_loses_no_event() {
         Some(StreamTransport::new(stream))
     };
     let pull = Arc::new(AtomicBool::new(false));
-    survives(&format!("tcp://{address}"), Box::new(Loose { line: None, plug, pull: pull.clone() }), &pull);
+    let line = Loose { line: None, plug, pull: pull.clone() };
+    (format!("tcp://{address}"), Box::new(line), pull)
+}
+
+#[test]
+fn a_line_that_is_pulled_out_loses_no_event() {
+    let (port, line, pull) = loose_tcp();
+    survives(&port, line, &pull);
 }
 
 #[cfg(unix)]
@@ -415,17 +422,9 @@ fn a_serial_line_that_is_pulled_out_loses_no_event() {
 
 #[test]
 fn a_box_that_was_reset_while_it_was_unplugged_is_told() {
-    let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("bind");
-    let address = listener.local_addr().expect("address");
-    listener.set_nonblocking(true).expect("nonblocking");
-    let plug = move || {
-        let (stream, _) = listener.accept().ok()?;
-        stream.set_read_timeout(Some(Duration::from_millis(1))).ok()?;
-        Some(StreamTransport::new(stream))
-    };
-    let pull = Arc::new(AtomicBool::new(false));
-    let rig = TestBox::serve(Box::new(Loose { line: None, plug, pull: pull.clone() }));
-    let mut link = Link::open(&format!("tcp://{address}"), options()).expect("hello");
+    let (port, line, pull) = loose_tcp();
+    let rig = TestBox::serve(line);
+    let mut link = Link::open(&port, options()).expect("hello");
     rig.faults.reset.store(true, SeqCst);
     pull.store(true, SeqCst);
     std::thread::sleep(Duration::from_millis(20));
