@@ -1,11 +1,13 @@
 //! Projections H g and back-projections Hᵀ f.
 
+mod axes;
 mod basis;
 mod blocks;
 mod direct;
 mod engine;
 mod fft;
 mod gemm;
+mod multiply;
 mod normal;
 mod symmetry;
 mod tiles;
@@ -18,11 +20,11 @@ pub use symmetry::Symmetries;
 use crate::error::OperatorError;
 use crate::psf::{Psf, PsfShape};
 use basis::Cell;
-use blocks::{Blocks, Kernel, Orbits, pack};
+use blocks::{Blocks, Kernel, Orbits, block_of, pack};
 pub(crate) use engine::Spectra;
 use engine::{Engine, Port, Side};
 use fft::good_length;
-use gemm::{Block, Half};
+use gemm::Half;
 use serde::{Deserialize, Serialize};
 use tiles::Tiles;
 
@@ -198,7 +200,7 @@ fn plan(geometry: &Geometry, symmetries: Symmetries, storage: Storage) -> Memory
     let rows = shape.pixels[0] * shape.pixels[1];
     let columns = shape.voxels[0] * shape.voxels[1] * shape.planes;
     let count = orbits.orbits.len() as u64;
-    let block = Block::new(if reduction.is_real() { rows } else { 2 * rows }, columns);
+    let block = block_of(rows, columns, reduction.is_real());
     let bytes = if storage == Storage::F16 { 2 } else { 4 };
     let engine = Engine::new(grid, reduction.is_real(), orbits);
     let [volume, sensor] = sides(geometry, grid);
