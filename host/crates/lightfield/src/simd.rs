@@ -43,6 +43,31 @@ pub(crate) fn run<K: Kernel>(level: Level, kernel: K) -> K::Output {
     }
 }
 
+/// The lanes in reverse order.
+#[inline(always)]
+pub(crate) fn reversed<S: Simd>(s: S, v: V<S>) -> V<S> {
+    // known when a kernel is compiled
+    #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+    if let Some(avx2) = s.level().as_avx2() {
+        let lanes: [f32; LANES] = v.into();
+        let lanes: [f32; LANES] = permuted(avx2, V::from_slice(avx2, &lanes)).into();
+        return V::from_slice(s, &lanes);
+    }
+    s.reverse_f32x8(v)
+}
+
+#[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+fearless_simd::kernel! {
+    fn permuted(s: Avx2, v: V<Avx2>) -> V<Avx2> {
+        use fearless_simd::SimdFrom;
+        #[cfg(target_arch = "x86")]
+        use std::arch::x86::{_mm256_permutevar8x32_ps, _mm256_setr_epi32};
+        #[cfg(target_arch = "x86_64")]
+        use std::arch::x86_64::{_mm256_permutevar8x32_ps, _mm256_setr_epi32};
+        V::simd_from(s, _mm256_permutevar8x32_ps(v.into(), _mm256_setr_epi32(7, 6, 5, 4, 3, 2, 1, 0)))
+    }
+}
+
 /// Rows of eight vectors as columns.
 #[inline(always)]
 pub(crate) fn transposed<S: Simd>(s: S, mut rows: [V<S>; LANES]) -> [V<S>; LANES] {

@@ -62,15 +62,17 @@ struct Step {
 pub(crate) struct Table {
     /// The channel from which each comes, unless it is its own.
     pub(crate) from: Option<Vec<u32>>,
-    /// (a, b, c, d) with re′ = a re + b im and im′ = c re + d im, each for all padded channels: a rotation by a
-    /// quarter turn, and signs.
-    pub(crate) mix: [Vec<f32>; 4],
+    /// Cosine a and sine b of a turn by a multiple of 90°, for all padded channels: re′ = a re + b im,
+    /// im′ = ±(a im − b re).
+    pub(crate) turn: [Vec<f32>; 2],
+    /// The sign of im′.
+    pub(crate) sign: f32,
 }
 
 impl Table {
     fn new(cell: &Cell, padded: usize, real: bool, step: Step) -> Self {
         let mut from: Vec<u32> = (0..padded as u32).collect();
-        let mut mix = [(); 4].map(|()| vec![0f32; padded]);
+        let mut turn = [(); 2].map(|()| vec![0f32; padded]);
         for (c, from) in from.iter_mut().enumerate().take(cell.channels()) {
             let (y, x, i) = cell.split(c);
             let (mut sy, mut sx) = if step.exchange { (x, y) } else { (y, x) };
@@ -90,13 +92,13 @@ impl Table {
             *from = cell.at(sy, sx, i) as u32;
             if real && cell.parity(0, y) * cell.parity(1, x) < 0.0 {
                 // times −i
-                (mix[1][c], mix[2][c]) = (f, -f);
+                turn[1][c] = f;
             } else {
-                (mix[0][c], mix[3][c]) = (f, if step.conjugate_x { -f } else { f });
+                turn[0][c] = f;
             }
         }
         let moved = from.iter().enumerate().any(|(c, f)| c as u32 != *f);
-        Self { from: moved.then_some(from), mix }
+        Self { from: moved.then_some(from), turn, sign: if step.conjugate_x { -1.0 } else { 1.0 } }
     }
 }
 

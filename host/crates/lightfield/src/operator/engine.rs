@@ -234,9 +234,9 @@ impl Work for Butterflies<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, s: S) {
         for cell in self.values.chunks_exact_mut(self.side.padded) {
-            self.side.cell.butterfly(cell);
+            self.side.cell.butterfly_with(s, cell);
         }
     }
 }

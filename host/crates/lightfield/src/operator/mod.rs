@@ -454,18 +454,22 @@ impl Layout {
         self.cells[0] * self.row()
     }
 
-    /// Runs `work(packed place, place in [z][y][x])`.
-    fn each(&self, mut work: impl FnMut(usize, usize)) {
+    /// Runs `work(packed place, place in [z][y][x], numbers)` for what follows each other in both.
+    fn each(&self, mut work: impl FnMut(usize, usize, usize)) {
         let [ny, nx] = self.cell.n;
         let (height, width) = (self.cells[0] * ny, self.cells[1] * nx);
         for cy in 0..self.cells[0] {
             for cx in 0..self.cells[1] {
                 let first = (cy * self.cells[1] + cx) * self.padded;
                 for y in 0..ny {
+                    let plain = (cy * ny + y) * width + cx * nx;
+                    if self.cell.inner == 1 {
+                        work(first + self.cell.at(y, 0, 0), plain, nx);
+                        continue;
+                    }
                     for x in 0..nx {
                         for i in 0..self.cell.inner {
-                            let to = (i * height + cy * ny + y) * width + cx * nx + x;
-                            work(first + self.cell.at(y, x, i), to);
+                            work(first + self.cell.at(y, x, i), i * height * width + plain + x, 1);
                         }
                     }
                 }
@@ -475,13 +479,13 @@ impl Layout {
 
     pub(crate) fn pack(&self, values: &[f32]) -> Vec<f32> {
         let mut out = vec![0f32; self.len()];
-        self.each(|packed, plain| out[packed] = values[plain]);
+        self.each(|to, from, n| out[to..to + n].copy_from_slice(&values[from..from + n]));
         out
     }
 
     pub(crate) fn unpack(&self, packed: &[f32]) -> Vec<f32> {
         let mut out = vec![0f32; self.cells[0] * self.cells[1] * self.cell.channels()];
-        self.each(|p, plain| out[plain] = packed[p]);
+        self.each(|from, to, n| out[to..to + n].copy_from_slice(&packed[from..from + n]));
         out
     }
 

@@ -14,44 +14,43 @@ fn part<S: Simd>(s: S, values: &[f32], at: usize) -> V<S> {
     V::from_slice(s, &values[at..at + LANES])
 }
 
-/// (a re + b im, c re + d im) f
-#[inline(always)]
-fn rotate<S: Simd>(s: S, [a, b, c, d]: [&[f32]; 4], from: &[f32], to: &mut [f32], f: f32) {
-    let f = V::splat(s, f);
-    let (from_re, from_im) = from.split_at(from.len() / 2);
-    let (to_re, to_im) = to.split_at_mut(to.len() / 2);
-    for at in (0..to_re.len()).step_by(LANES) {
-        let (re, im) = (part(s, from_re, at) * f, part(s, from_im, at) * f);
-        // of each pair of factors one is zero: nothing is rounded
-        part(s, a, at).mul_add(re, part(s, b, at) * im).store_slice(&mut to_re[at..at + LANES]);
-        part(s, c, at).mul_add(re, part(s, d, at) * im).store_slice(&mut to_im[at..at + LANES]);
-    }
-}
-
 impl Table {
-    /// A spectrum [re|im][channel] as a vector of the block. `turned`: as long.
+    /// Lanes of a spectrum [re|im][channel], whose channels are in the block's order, as vectors of the block.
     #[inline(always)]
-    fn apply<S: Simd>(&self, s: S, from: &[f32], to: &mut [f32], turned: &mut [f32]) {
+    fn apply<S: Simd>(&self, s: S, from: &[f32], at: usize, sign: V<S>) -> [V<S>; 2] {
+        let (re, im) = (part(s, from, at), part(s, from, from.len() / 2 + at));
+        let [a, b] = [part(s, &self.turn[0], at), part(s, &self.turn[1], at)];
+        // of a and b one is zero, the other ±1: nothing is rounded
+        [a.mul_add(re, b * im), sign * a.mul_sub(im, b * re)]
+    }
+
+    /// A spectrum's channels in the block's order, in `turned` if they have to be moved.
+    #[inline(always)]
+    fn ordered<'a>(&self, from: &'a [f32], turned: &'a mut [f32]) -> &'a [f32] {
+        let Some(list) = &self.from else { return from };
         let c = from.len() / 2;
-        let [rr, ri, ir, ii] = &self.mix;
-        let mix = [&**rr, &**ri, &**ir, &**ii];
-        let Some(list) = &self.from else { return rotate(s, mix, from, to, 1.0) };
         let (re, im) = turned.split_at_mut(c);
         let (from_re, from_im) = from.split_at(c);
         for ((re, im), &at) in re.iter_mut().zip(im).zip(list) {
             (*re, *im) = (from_re[at as usize], from_im[at as usize]);
         }
-        rotate(s, mix, turned, to, 1.0);
+        turned
     }
 
-    /// The way back, times `scale`.
+    /// The way back, times `scale`. `turned`: as long.
     #[inline(always)]
     pub(super) fn undo<S: Simd>(&self, s: S, from: &[f32], to: &mut [f32], turned: &mut [f32], scale: f32) {
         let c = from.len() / 2;
-        let [rr, ri, ir, ii] = &self.mix;
-        let mix = [&**rr, &**ir, &**ri, &**ii];
-        let Some(list) = &self.from else { return rotate(s, mix, from, to, scale) };
-        rotate(s, mix, from, turned, scale);
+        let moved = self.from.is_some();
+        let (re, im) = if moved { &mut *turned } else { &mut *to }.split_at_mut(c);
+        let (f, g) = (V::splat(s, scale), V::splat(s, scale * self.sign));
+        for at in (0..c).step_by(LANES) {
+            let (u, v) = (part(s, from, at) * f, part(s, from, c + at) * g);
+            let [a, b] = [part(s, &self.turn[0], at), part(s, &self.turn[1], at)];
+            a.mul_sub(u, b * v).store_slice(&mut re[at..at + LANES]);
+            a.mul_add(v, b * u).store_slice(&mut im[at..at + LANES]);
+        }
+        let Some(list) = &self.from else { return };
         let (re, im) = turned.split_at(c);
         let (to_re, to_im) = to.split_at_mut(c);
         for ((re, im), &at) in re.iter().zip(im).zip(list) {
@@ -63,8 +62,7 @@ impl Table {
 /// Vectors of a block, in and out.
 #[derive(Default)]
 pub(super) struct BlockScratch {
-    /// [vector][channel]: re and im of one spectrum after the other.
-    vectors: Vec<f32>,
+    /// [spectrum][re|im][channel].
     turned: Vec<f32>,
     x: Vec<f32>,
     y: Vec<f32>,
@@ -95,10 +93,9 @@ impl<T: Element> Work for Multiply<'_, '_, T> {
         let block = &blocks.block;
         let (c, c_to) = (from.side.padded, to.side.padded);
         let tall = block.padded_rows();
-        let BlockScratch { vectors, turned, x, y } = scratch;
+        let BlockScratch { turned, x, y } = scratch;
         let most = VECTORS * tall.max(block.columns.next_multiple_of(LANES));
-        vectors.resize(VECTORS * c, 0.0);
-        turned.resize(2 * c, 0.0);
+        turned.resize(VECTORS * c, 0.0);
         x.resize(most, 0.0);
         y.resize(most, 0.0);
         for (i, part) in parts.iter_mut().enumerate() {
@@ -109,20 +106,21 @@ impl<T: Element> Work for Multiply<'_, '_, T> {
                 let count = JOBS.min(jobs - begin);
                 // (frame, member)
                 let job = |j: usize| ((begin + j) / members.len(), (begin + j) % members.len());
-                for (j, to) in vectors.chunks_exact_mut(2 * c).enumerate() {
-                    if j >= count {
-                        to.fill(0.0);
-                        continue;
-                    }
+                let mut spectra: [&[f32]; JOBS] = [&[]; JOBS];
+                let mut tables = [&from.tables[0]; JOBS];
+                for (j, turned) in turned.chunks_exact_mut(2 * c).enumerate().take(count) {
                     let (f, m) = job(j);
                     let at = (members[m].kx * engine.grid[0] + members[m].ky) * 2 * c;
-                    from.tables[members[m].step].apply(s, &planes[f][at..at + 2 * c], to, turned);
+                    tables[j] = &from.tables[members[m].step];
+                    spectra[j] = tables[j].ordered(&planes[f][at..at + 2 * c], turned);
                 }
+                let signs = tables.map(|t| V::splat(s, t.sign));
                 let (upper, lower) = x.split_at_mut(VECTORS * c);
                 for channel in (0..c).step_by(LANES) {
                     let mut rows = [V::splat(s, 0.0); VECTORS];
-                    for (v, row) in rows.iter_mut().enumerate() {
-                        *row = V::from_slice(s, &vectors[v * c + channel..][..LANES]);
+                    for j in 0..count {
+                        let [re, im] = tables[j].apply(s, spectra[j], channel, signs[j]);
+                        (rows[2 * j], rows[2 * j + 1]) = (re, im);
                     }
                     store(s, rows, &mut upper[channel * VECTORS..]);
                     if adjoint && !blocks.real {
