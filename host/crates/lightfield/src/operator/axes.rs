@@ -1,6 +1,6 @@
 //! Transforms of the cells' channels along the two axes of the lenslet grid.
 
-use super::engine::{Engine, Port, Side};
+use super::engine::{Engine, Side};
 use super::fft::{C, NOTHING, Source, result};
 use crate::simd::{Kernel as Work, LANES, V};
 use fearless_simd::prelude::*;
@@ -131,15 +131,14 @@ impl Work for ColumnForth<'_> {
     }
 }
 
-/// One frequency k_x back along y, from the products of the orbits.
+/// One frequency k_x back along y.
 pub(super) struct ColumnBack<'a> {
     pub(super) engine: &'a Engine,
-    pub(super) port: &'a Port,
+    pub(super) side: &'a Side,
     pub(super) products: &'a [f32],
     pub(super) out: &'a mut [f32],
     pub(super) kx: usize,
     pub(super) scratch: &'a mut Vec<f32>,
-    pub(super) scale: f32,
 }
 
 impl Work for ColumnBack<'_> {
@@ -147,21 +146,12 @@ impl Work for ColumnBack<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let Self { engine, port, products, out, kx, scratch, scale } = self;
-        let side = &port.side;
+        let Self { engine, side, products, out, kx, scratch } = self;
         let (plan, c, n) = (&engine.plans[0], side.padded, engine.grid[0]);
         let wide = 2 * c;
-        scratch.resize(plan.scratch() + (n + 1) * wide, 0.0);
-        let (scratch, column) = scratch.split_at_mut(plan.scratch());
-        let (column, turned) = column.split_at_mut(n * wide);
-        for (ky, to) in column.chunks_exact_mut(wide).enumerate() {
-            let (orbit, member) = engine.orbits.place[kx * n + ky];
-            let step = engine.orbits.orbits[orbit as usize].members[member as usize].step;
-            let from = &products[(orbit as usize * engine.orbits.slots + member as usize) * wide..][..wide];
-            port.tables[step].undo(s, from, to, turned, scale);
-        }
-        let offsets: Vec<usize> = (0..n).map(|k| k * wide).collect();
-        let source = Source { values: column, offsets: &offsets, imaginary: c };
+        scratch.resize(plan.scratch(), 0.0);
+        let offsets: Vec<usize> = (0..n).map(|k| (kx * n + k) * wide).collect();
+        let source = Source { values: products, offsets: &offsets, imaginary: c };
         // real rows have real coefficients here
         let real = kx == 0 || 2 * kx == engine.grid[1];
         let zero = V::splat(s, 0.0);

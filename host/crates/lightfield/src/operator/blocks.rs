@@ -124,8 +124,6 @@ pub(crate) struct Orbits {
     /// (orbit, member) of frequency [kx][ky].
     pub(crate) place: Vec<(u32, u32)>,
     steps: Vec<Step>,
-    /// Most members of an orbit.
-    pub(crate) slots: usize,
 }
 
 impl Orbits {
@@ -168,8 +166,7 @@ impl Orbits {
                 orbits.push(orbit);
             }
         }
-        let slots = orbits.iter().map(|o| o.members.len()).max().unwrap_or(1);
-        Self { orbits, place, steps, slots }
+        Self { orbits, place, steps }
     }
 
     pub(crate) fn tables(&self, cell: &Cell, padded: usize, real: bool) -> Vec<Table> {

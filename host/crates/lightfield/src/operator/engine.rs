@@ -50,10 +50,18 @@ pub(crate) struct Spectra {
     pub(crate) rows: Vec<f32>,
     /// [kx][ky][re|im][channel].
     plane: Vec<f32>,
-    /// Products, [orbit][member][re|im][channel].
+    /// Products, in the same order.
     products: Vec<f32>,
     /// Back along y, as the rows' transforms want it: [kx][pair of rows][kx|−kx][re|im][channel].
     columns: Vec<f32>,
+}
+
+/// The first `n` numbers of a buffer that grows when it has to: volumes and sensors take turns.
+fn room(buffer: &mut Vec<f32>, n: usize) -> &mut [f32] {
+    if buffer.len() < n {
+        buffer.resize(n, 0.0);
+    }
+    &mut buffer[..n]
 }
 
 /// Work on a row of cells: (row, its numbers, its part of the state).
@@ -92,8 +100,7 @@ impl Engine {
     /// Numbers that the spectra of one frame take.
     pub(crate) fn spectra_len(&self, a: &Side, b: &Side) -> usize {
         let (most, tall) = (a.padded.max(b.padded), a.cells[0].max(b.cells[0]));
-        2 * most
-            * (self.half() * (2 * tall + 1 + self.grid[0]) + self.orbits.orbits.len() * self.orbits.slots)
+        2 * most * self.half() * (2 * tall + 1 + 2 * self.grid[0])
     }
 
     /// Rows of cells: what comes back from the spectrum (`columns`, if given) is handed to `work` with the
@@ -109,11 +116,9 @@ impl Engine {
     ) {
         let row = side.row();
         let spectrum = self.half() * 2 * side.padded;
-        if forth {
-            // every number that is read later is written first
-            spectra.rows.resize(side.cells[0] * spectrum, 0.0);
-        }
         let Spectra { rows, columns, .. } = spectra;
+        // every number that is read later is written first
+        let rows = room(rows, if forth { side.cells[0] * spectrum } else { 0 });
         let columns: &[f32] = if back { columns } else { &[] };
         let task = |pair: usize, rows: &mut [f32], state: &mut [f32], local: &mut [Vec<f32>; 2]| {
             let [values, scratch] = local;
@@ -170,25 +175,32 @@ impl Engine {
         let (half, py) = (self.half(), self.grid[0]);
         let (wide, wide_to) = (2 * from.side.padded, 2 * to.side.padded);
         for f in frames.iter_mut() {
-            f.plane.resize(half * py * wide, 0.0);
             let Spectra { rows, plane, .. } = f;
             let rows: &[f32] = rows;
+            let plane = room(plane, half * py * wide);
             plane.par_chunks_mut(py * wide).enumerate().for_each_init(Vec::new, |scratch, (kx, out)| {
                 run(self.level, ColumnForth { engine: self, side: &from.side, rows, out, kx, scratch });
             });
         }
-        let slot = self.orbits.slots * wide_to;
+        // products of an orbit: of all members, frame by frame
         let count = self.orbits.orbits.len();
-        for f in frames.iter_mut() {
-            f.products.resize(count * slot, 0.0);
+        let batch = frames.len();
+        let mut parts: Vec<Vec<&mut [f32]>> = self
+            .orbits
+            .orbits
+            .iter()
+            .map(|o| (0..batch * o.members.len()).map(|_| Default::default()).collect())
+            .collect();
+        let mut planes: Vec<&[f32]> = Vec::with_capacity(batch);
+        for (f, Spectra { plane, products, .. }) in frames.iter_mut().enumerate() {
+            planes.push(plane);
+            let products = room(products, half * py * wide_to).chunks_mut(wide_to);
+            for (product, &(orbit, member)) in products.zip(&self.orbits.place) {
+                let part = &mut parts[orbit as usize];
+                let members = part.len() / batch;
+                part[f * members + member as usize] = product;
+            }
         }
-        let (planes, mut products): (Vec<&[f32]>, Vec<_>) = frames
-            .iter_mut()
-            .map(|Spectra { plane, products, .. }| (&**plane, products.chunks_mut(slot)))
-            .unzip();
-        // products of an orbit, of all frames
-        let mut parts: Vec<Vec<&mut [f32]>> =
-            (0..count).map(|_| products.iter_mut().filter_map(|p| p.next()).collect()).collect();
         let chunk = count.div_ceil(64).max(1);
         parts.par_chunks_mut(chunk).enumerate().for_each_init(
             BlockScratch::default,
@@ -212,14 +224,11 @@ impl Engine {
         );
         for f in frames.iter_mut() {
             let column = to.side.cells[0].div_ceil(2) * 2 * wide_to;
-            f.columns.resize(half * column, 0.0);
             let Spectra { products, columns, .. } = f;
             let products: &[f32] = products;
+            let columns = room(columns, half * column);
             columns.par_chunks_mut(column).enumerate().for_each_init(Vec::new, |scratch, (kx, out)| {
-                run(
-                    self.level,
-                    ColumnBack { engine: self, port: to, products, out, kx, scratch, scale: blocks.scale },
-                );
+                run(self.level, ColumnBack { engine: self, side: &to.side, products, out, kx, scratch });
             });
         }
     }

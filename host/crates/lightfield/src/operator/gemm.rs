@@ -14,8 +14,11 @@ pub(crate) const VECTORS: usize = 8;
 const AHEAD: usize = 4096;
 /// Columns between two requests.
 const GROUP: usize = 4;
+/// Columns of a panel that are summed at a time in the transposed product: with the eight rows all registers
+/// of AVX2.
+const SUMS: usize = 6;
 /// Columns that are converted at a time.
-const CONVERTED: usize = 16;
+const CONVERTED: usize = 4 * SUMS;
 
 /// How a block's numbers are stored.
 pub(crate) trait Element: Copy + Send + Sync + Default + 'static {
@@ -150,10 +153,10 @@ impl Block {
             for (a, y) in parts {
                 ahead(a);
                 let plain = T::plain(s, a, &mut scratch);
-                let (groups, rest) = plain.as_chunks::<{ GROUP * LANES }>();
-                let (y_groups, y_rest) = y.as_chunks_mut::<{ GROUP * VECTORS }>();
+                let (groups, rest) = plain.as_chunks::<{ SUMS * LANES }>();
+                let (y_groups, y_rest) = y.as_chunks_mut::<{ SUMS * VECTORS }>();
                 for (a, y) in groups.iter().zip(y_groups) {
-                    columns::<S, GROUP>(s, a, &rows, y);
+                    columns::<S, SUMS>(s, a, &rows, y);
                 }
                 for (a, y) in rest.chunks_exact(LANES).zip(y_rest.chunks_exact_mut(VECTORS)) {
                     columns::<S, 1>(s, a, &rows, y);

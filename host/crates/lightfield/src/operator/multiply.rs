@@ -42,6 +42,7 @@ impl Table {
     pub(super) fn undo<S: Simd>(&self, s: S, from: &[f32], to: &mut [f32], turned: &mut [f32], scale: f32) {
         let c = from.len() / 2;
         let moved = self.from.is_some();
+        let turned = &mut turned[..2 * c];
         let (re, im) = if moved { &mut *turned } else { &mut *to }.split_at_mut(c);
         let (f, g) = (V::splat(s, scale), V::splat(s, scale * self.sign));
         for at in (0..c).step_by(LANES) {
@@ -79,7 +80,7 @@ pub(super) struct Multiply<'a, 'b, T> {
     pub(super) planes: &'a [&'b [f32]],
     /// The first orbit.
     pub(super) first: usize,
-    /// Products of each orbit and frame.
+    /// Where the products of each orbit go: of all members, frame by frame.
     pub(super) parts: &'a mut [Vec<&'b mut [f32]>],
     pub(super) scratch: &'a mut BlockScratch,
 }
@@ -95,10 +96,10 @@ impl<T: Element> Work for Multiply<'_, '_, T> {
         let tall = block.padded_rows();
         let BlockScratch { turned, x, y } = scratch;
         let most = VECTORS * tall.max(block.columns.next_multiple_of(LANES));
-        turned.resize(VECTORS * c, 0.0);
+        turned.resize((VECTORS * c).max(2 * c_to), 0.0);
         x.resize(most, 0.0);
         y.resize(most, 0.0);
-        for (i, part) in parts.iter_mut().enumerate() {
+        for (i, products) in parts.iter_mut().enumerate() {
             let members = &engine.orbits.orbits[first + i].members;
             let a = &blocks.data[(first + i) * block.len()..][..block.len()];
             let jobs = planes.len() * members.len();
@@ -140,32 +141,29 @@ impl<T: Element> Work for Multiply<'_, '_, T> {
                     for channel in (0..c_to).step_by(LANES) {
                         let mut rows = [V::splat(s, 0.0); VECTORS];
                         for (r, row) in rows.iter_mut().enumerate() {
-                            *row = V::from_slice(s, &y[(channel + r) * VECTORS..][..LANES]);
+                            *row = part(s, y, (channel + r) * VECTORS);
                         }
                         let rows = transposed(s, rows);
-                        for j in 0..count {
-                            let (f, m) = job(j);
-                            let out = &mut part[f][m * 2 * c_to + channel..];
-                            rows[2 * j].store_slice(&mut out[..LANES]);
-                            rows[2 * j + 1].store_slice(&mut out[c_to..c_to + LANES]);
+                        for (v, row) in rows.iter().enumerate().take(2 * count) {
+                            row.store_slice(&mut x[v * c_to + channel..][..LANES]);
                         }
                     }
-                    continue;
                 }
                 for j in 0..count {
-                    let (f, m) = job(j);
-                    let out = &mut part[f][m * 2 * c_to..][..2 * c_to];
-                    let y = &y[2 * j * tall..][..2 * tall];
-                    if blocks.real {
-                        out.copy_from_slice(y);
+                    let out = &mut products[begin + j];
+                    let table = &to.tables[members[job(j).1].step];
+                    if adjoint {
+                        table.undo(s, &x[2 * j * c_to..][..2 * c_to], out, turned, blocks.scale);
                         continue;
                     }
-                    let (re, im) = out.split_at_mut(c_to);
-                    let (u, v) = y.split_at(tall);
-                    for n in 0..c_to {
-                        re[n] = u[n] - v[c_to + n];
-                        im[n] = u[c_to + n] + v[n];
+                    let y = &mut y[2 * j * tall..][..2 * tall];
+                    if !blocks.real {
+                        let (u, v) = y.split_at_mut(tall);
+                        for n in 0..c_to {
+                            (u[n], u[c_to + n]) = (u[n] - v[c_to + n], u[c_to + n] + v[n]);
+                        }
                     }
+                    table.undo(s, &y[..2 * c_to], out, turned, blocks.scale);
                 }
             }
         }

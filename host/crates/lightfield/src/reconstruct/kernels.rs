@@ -66,21 +66,41 @@ impl Kernel for Pixels<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, _: S) -> f64 {
-        let Self { rl, variance: v, floor, values, f, b, w } = self;
+        match (self.rl, self.b.is_none() && self.w.is_none()) {
+            (true, true) => self.all::<true, true>(),
+            (true, false) => self.all::<true, false>(),
+            (false, true) => self.all::<false, true>(),
+            (false, false) => self.all::<false, false>(),
+        }
+    }
+}
+
+impl Pixels<'_> {
+    /// `PLAIN`: no background, no weights.
+    #[inline(always)]
+    fn all<const RL: bool, const PLAIN: bool>(self) -> f64 {
+        let Self { variance: v, floor, values, f, b, w, .. } = self;
         let mut sum = [0f32; LANES];
         let mut total = 0.0;
         let parts = values.as_chunks_mut::<LANES>().0.iter_mut().zip(f.as_chunks::<LANES>().0);
         for (i, (values, f)) in parts.enumerate() {
-            let of = |list: Option<&[f32]>, other| {
-                list.and_then(|l| l[i * LANES..].first_chunk::<LANES>()).copied().unwrap_or([other; LANES])
-            };
-            let (b, w) = (of(b, 0.0), of(w, 1.0));
+            let (mut back, mut weight) = ([0f32; LANES], [1f32; LANES]);
+            if !PLAIN {
+                let of = |list: Option<&[f32]>, other| {
+                    list.and_then(|l| l[i * LANES..].first_chunk()).copied().unwrap_or(other)
+                };
+                (back, weight) = (of(b, back), of(w, weight));
+            }
             for j in 0..LANES {
-                let estimate = values[j];
-                let d = f[j] - estimate - b[j];
-                sum[j] += w[j] * d * d;
-                values[j] =
-                    if rl { w[j] * (f[j] + v) / (estimate + b[j] + v).max(floor) } else { w[j] * estimate };
+                let d = f[j] - values[j] - back[j];
+                sum[j] += weight[j] * d * d;
+            }
+            for j in 0..LANES {
+                values[j] = if RL {
+                    weight[j] * (f[j] + v) / (values[j] + back[j] + v).max(floor)
+                } else {
+                    weight[j] * values[j]
+                };
             }
             if i % 64 == 63 {
                 total += sum.iter().map(|s| f64::from(*s)).sum::<f64>();
