@@ -166,20 +166,19 @@ fn from_white_image_to_volume() {
     });
     save(&path("seen.png"), SIZE[0], &seen, 30_000.0 / largest);
 
-    let summary = json(&[
-        "lightfield",
-        "reconstruct",
-        text(&setup),
-        text(&path("ideal.png")),
-        "--out",
-        text(&path("a")),
-        "--psf",
-        text(&stored),
-        "--format",
-        "tiff,ome-tiff,ome-zarr",
-        "--background",
-        "0",
-    ]);
+    let command = |frame: &str, out: &str, more: &[&str]| -> Vec<String> {
+        let (frame, out) = (path(frame), path(out));
+        let basic = ["lightfield", "reconstruct", text(&setup), text(&frame), "--out", text(&out)];
+        let all = [&basic[..], &["--psf", text(&stored)], more].concat();
+        all.into_iter().map(str::to_owned).collect()
+    };
+    let run = |c: &[String]| json(&c.iter().map(String::as_str).collect::<Vec<_>>());
+    let whole = command("ideal.png", "a", &["--format", "tiff,ome-tiff,ome-zarr", "--background", "0"]);
+    let tiff = command("ideal.png", "a", &["--background", "0"]);
+    let summary = run(&tiff);
+    assert!(!path("a/ideal.ome.tif").exists());
+    // what is asked for later is made then
+    assert_eq!(run(&whole)["resumed"], 0);
     assert_eq!(summary["psf_reused"], true);
     let shape = [PLANES, 11 * S, 11 * S];
     let (values, found) = read_stack(&path("a/ideal.tif")).expect("stack");
@@ -190,39 +189,26 @@ fn from_white_image_to_volume() {
     let residuals = summary["frames"][0]["residuals"].as_array().expect("residuals");
     assert!(residuals.last().and_then(Value::as_f64) < residuals[1].as_f64(), "{residuals:?}");
     // what is there is not computed again
-    let again = json(&[
-        "lightfield",
-        "reconstruct",
-        text(&setup),
-        text(&path("ideal.png")),
-        "--out",
-        text(&path("a")),
-        "--psf",
-        text(&stored),
-        "--format",
-        "tiff,ome-tiff,ome-zarr",
-        "--background",
-        "0",
-    ]);
-    assert_eq!(again["resumed"], 1);
+    for same in [&whole, &tiff] {
+        assert_eq!(run(same)["resumed"], 1);
+    }
+    // nor mistaken for another frame of that name
+    let other: Vec<f32> = image.iter().rev().copied().collect();
+    save(&path("ideal.png"), 11 * N, &other, 30_000.0 / largest);
+    let said = refused(&whole.iter().map(String::as_str).collect::<Vec<_>>());
+    assert!(
+        said.contains("ideal.json") && said.contains("changed") && said.contains("--overwrite"),
+        "{said}"
+    );
+    let anew: Vec<String> = whole.iter().cloned().chain(["--overwrite".to_owned()]).collect();
+    assert_eq!(run(&anew)["resumed"], 0);
+    let (values, _) = read_stack(&path("a/ideal.tif")).expect("stack");
+    let [_, y, x] = highest(&values, shape);
+    assert_eq!([y, x], [11 * S - 1 - at[1], 11 * S - 1 - at[2]]);
 
-    json(&[
-        "lightfield",
-        "reconstruct",
-        text(&setup),
-        text(&path("seen.png")),
-        "--out",
-        text(&path("b")),
-        "--psf",
-        text(&stored),
-        "--lattice",
-        text(&path("lattice.toml")),
-        "--white",
-        text(&path("white.png")),
-        "--storage",
-        "f16",
-        "--momentum",
-    ]);
+    let (lattice, white) = (path("lattice.toml"), path("white.png"));
+    let corrected = ["--lattice", text(&lattice), "--white", text(&white)];
+    run(&command("seen.png", "b", &[&corrected[..], &["--storage", "f16", "--momentum"]].concat()));
     let (values, shape) = read_stack(&path("b/seen.tif")).expect("stack");
     let [_, height, width] = shape;
     let found = highest(&values, shape);

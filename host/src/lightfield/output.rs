@@ -45,7 +45,7 @@ pub fn write(
 ) -> Result<Vec<PathBuf>, Error> {
     let mut written = Vec::new();
     for format in formats {
-        let path = folder.join(format!("{name}.{}", format.ending()));
+        let path = stack_path(folder, name, *format);
         match format {
             Format::Tiff => volume.write_tiff(&path),
             Format::OmeTiff => volume.write_ome_tiff(&path),
@@ -63,6 +63,11 @@ pub fn write(
         written.push(path);
     }
     Ok(written)
+}
+
+/// Where a volume is written.
+pub fn stack_path(folder: &Path, name: &str, format: Format) -> PathBuf {
+    folder.join(format!("{name}.{}", format.ending()))
 }
 
 fn stack_error(path: &Path, error: VolumeError) -> Error {

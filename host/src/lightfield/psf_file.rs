@@ -20,8 +20,20 @@ struct Header {
 
 /// Hash of anything that has a form as JSON: its CRC-64, in hexadecimal.
 pub fn hash(value: &impl Serialize) -> String {
-    let json = serde_json::to_string(value).unwrap_or_default();
-    format!("{:016x}", crc::Crc::<u64>::new(&crc::CRC_64_XZ).checksum(json.as_bytes()))
+    hash_bytes(serde_json::to_string(value).unwrap_or_default().as_bytes())
+}
+
+fn hash_bytes(bytes: &[u8]) -> String {
+    format!("{:016x}", crc::Crc::<u64>::new(&crc::CRC_64_XZ).checksum(bytes))
+}
+
+/// CRC-64/XZ of what a file holds, as 16 hexadecimal digits.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn hash_file(path: &Path) -> Result<String, Error> {
+    let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
+    Ok(hash_bytes(&bytes))
 }
 
 /// Writes a point spread function.

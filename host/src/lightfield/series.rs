@@ -4,7 +4,7 @@ use super::error::LightFieldError;
 use super::frames::{CellFrame, Corrections, FrameReader};
 use super::numbers_file::{self, NumbersError};
 use super::output::{self, Format};
-use super::psf_file::{self, hash};
+use super::psf_file::{self, hash, hash_file};
 use super::setup::Setup;
 use crate::error::Error;
 use crate::progress::Progress;
@@ -102,7 +102,8 @@ struct Key<'a> {
     storage: Storage,
     lattice: &'a Option<daic_lightfield::lattice::Lattice>,
     crop: Option<[[usize; 2]; 2]>,
-    corrections: [&'a Option<PathBuf>; 3],
+    /// What white, dark and bad-pixel images hold.
+    corrections: Vec<Option<String>>,
     mask_saturated: bool,
 }
 
@@ -110,6 +111,8 @@ struct Key<'a> {
 #[derive(Serialize, Deserialize)]
 struct Finished {
     key: String,
+    /// What the frame's files held.
+    input: String,
     #[serde(flatten)]
     done: Done,
 }
@@ -119,6 +122,7 @@ const STATE: &[u8; 8] = b"DAICLFS1";
 #[derive(Serialize, Deserialize)]
 struct StateHeader {
     key: String,
+    input: String,
     iterations: usize,
     residuals: Vec<f64>,
     changes: Vec<f64>,
@@ -166,6 +170,10 @@ pub fn run(setup: &Setup, options: &Options, progress: &dyn Progress) -> Result<
     if options.estimate_only {
         return Ok(summary);
     }
+    let corrections = [&options.corrections.white, &options.corrections.dark, &options.corrections.bad]
+        .map(|path| path.as_deref().map(hash_file).transpose())
+        .into_iter()
+        .collect::<Result<_, _>>()?;
     let key = hash(&Key {
         parameters: &parameters,
         settings: &options.settings,
@@ -174,13 +182,18 @@ pub fn run(setup: &Setup, options: &Options, progress: &dyn Progress) -> Result<
         storage: options.storage,
         lattice: &options.corrections.lattice,
         crop: options.corrections.crop,
-        corrections: [&options.corrections.white, &options.corrections.dark, &options.corrections.bad],
+        corrections,
         mask_saturated: options.corrections.mask_saturated,
     });
     let names = names(&options.frames);
     let mut left = Vec::new();
+    let mut inputs = Vec::new();
     for (i, name) in names.iter().enumerate() {
-        match finished(&options.out, name, &key, options.overwrite)? {
+        let files = [options.frames.get(i), options.minus.get(i)].into_iter().flatten();
+        let input = files.map(|path| hash_file(path)).collect::<Result<Vec<_>, _>>()?.join(" ");
+        let finished = finished(options, name, &key, &input)?;
+        inputs.push(input);
+        match finished {
             Some(done) => {
                 summary.resumed += 1;
                 summary.frames.push(done);
@@ -196,8 +209,16 @@ pub fn run(setup: &Setup, options: &Options, progress: &dyn Progress) -> Result<
     progress.stage(&format!("operator: {mib} MiB{tiles}"), 0);
     let model = model(&psf, &operator_settings, orders, &options.settings)?;
     for batch in left.chunks(options.batch.max(1)) {
-        let run =
-            Batch { options, reader: &reader, cells, names: &names, key: &key, model: &model, psf: &psf };
+        let run = Batch {
+            options,
+            reader: &reader,
+            cells,
+            names: &names,
+            inputs: &inputs,
+            key: &key,
+            model: &model,
+            psf: &psf,
+        };
         let path = run.go(batch, &mut summary, progress)?;
         summary.path = path;
     }
@@ -232,6 +253,8 @@ struct Batch<'a> {
     reader: &'a FrameReader,
     cells: [usize; 2],
     names: &'a [String],
+    /// What the files of each frame hold.
+    inputs: &'a [String],
     key: &'a str,
     model: &'a Model,
     psf: &'a Psf,
@@ -326,8 +349,8 @@ impl Batch<'_> {
         residuals: Vec<f64>,
         changes: Vec<f64>,
     ) -> Result<(), Error> {
-        let header =
-            StateHeader { key: self.key.to_owned(), iterations: state.iterations, residuals, changes };
+        let (key, input) = (self.key.to_owned(), self.inputs[i].clone());
+        let header = StateHeader { key, input, iterations: state.iterations, residuals, changes };
         let mut arrays = vec![state.volume.as_slice()];
         if let Some([a, b]) = &state.momentum {
             arrays.extend([a.as_slice(), b.as_slice()]);
@@ -353,6 +376,9 @@ impl Batch<'_> {
                 })?;
             if header.key != self.key {
                 return Err(bad("it belongs to a run with other settings".to_owned()).into());
+            }
+            if header.input != self.inputs[i] {
+                return Err(bad(CHANGED.to_owned()).into());
             }
             let mut arrays = arrays.into_iter();
             let volume = arrays.next().unwrap_or_default();
@@ -393,7 +419,8 @@ impl Batch<'_> {
         output::write_report(&page, name, &volume, &curves, provenance)?;
         files.push(page);
         let done = Done { name: name.clone(), iterations: state.iterations, residuals, changes, files };
-        let finished = Finished { key: self.key.to_owned(), done: done.clone() };
+        let (key, input) = (self.key.to_owned(), self.inputs[i].clone());
+        let finished = Finished { key, input, done: done.clone() };
         let path = out.join(format!("{name}.json"));
         let json = serde_json::to_vec_pretty(&finished)
             .map_err(|e| Error::Unwritable { path: path.clone(), reason: e.to_string() })?;
@@ -432,19 +459,24 @@ fn names(frames: &[PathBuf]) -> Vec<String> {
     out
 }
 
-/// Results that are there and belong to this run.
-fn finished(out: &Path, name: &str, key: &str, overwrite: bool) -> Result<Option<Done>, Error> {
-    let path = out.join(format!("{name}.json"));
-    if overwrite || !path.exists() {
+const CHANGED: &str = "the frame has changed since";
+
+/// Results that are there, in all formats that are asked for, and belong to this run.
+fn finished(options: &Options, name: &str, key: &str, input: &str) -> Result<Option<Done>, Error> {
+    let path = options.out.join(format!("{name}.json"));
+    if options.overwrite || !path.exists() {
         return Ok(None);
     }
     let text = std::fs::read(&path).map_err(|source| Error::Read { path: path.clone(), source })?;
-    match serde_json::from_slice::<Finished>(&text) {
-        Ok(f) if f.key == key && f.done.files.iter().all(|p| p.exists()) => Ok(Some(f.done)),
-        Ok(f) if f.key == key => Ok(None),
-        Ok(_) => {
-            Err(LightFieldError::State { path, reason: "it was made with other settings".to_owned() }.into())
-        }
-        Err(e) => Err(LightFieldError::State { path, reason: e.to_string() }.into()),
+    let bad = |reason: String| LightFieldError::State { path: path.clone(), reason };
+    let found: Finished = serde_json::from_slice(&text).map_err(|e| bad(e.to_string()))?;
+    if found.key != key {
+        return Err(bad("it was made with other settings".to_owned()).into());
     }
+    if found.input != input {
+        return Err(bad(CHANGED.to_owned()).into());
+    }
+    let stacks = options.formats.iter().map(|f| output::stack_path(&options.out, name, *f));
+    let whole = found.done.files.iter().cloned().chain(stacks).all(|p| p.exists());
+    Ok(whole.then_some(found.done))
 }
