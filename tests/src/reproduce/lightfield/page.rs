@@ -1,6 +1,6 @@
 //! The page of chapter 4 and its figures.
 
-use super::{Boxed, ITERATIONS, Models, Results, Widths};
+use super::{Boxed, Convergence, ITERATIONS, Models, Results, Widths};
 use crate::reproduce::ReproduceError;
 use crate::reproduce::document::{Part, row_of, table};
 use crate::reproduce::pictures::chart;
@@ -232,26 +232,35 @@ fn conditions(results: &Results, text: &mut String, figures: &mut Figures) -> Re
 }
 
 fn convergence(results: &Results, text: &mut String, figures: &mut Figures) -> Result<(), ReproduceError> {
-    let curve = |k: usize| results.convergence.iter().map(|c| (c[0], 100.0 * c[k])).collect::<Vec<_>>();
-    let (truth, last) = (curve(1), curve(2));
-    let end = last.last().map_or(0.0, |l| l.0);
-    // the last iterate's distance to itself is no news
-    let last = last[..last.len().saturating_sub(1)].to_vec();
-    let at = |c: &[(f64, f64)], n: f64| c.iter().find(|p| p.0 == n).map_or(f64::NAN, |p| p.1);
-    writeln!(
-        text,
-        "### Figure 20: convergence\n\n‖gⁿ − g‖/‖g‖ of a bead at 20 µm, 30°, `virtual`, after {ITERATIONS} iterations: {:.1} % of the truth, {:.1} % of iterate {end:.0}. The thesis states 0.675 % and does not say what g is. {}",
-        at(&truth, ITERATIONS as f64),
-        at(&last, ITERATIONS as f64),
-        if [&truth, &last].iter().any(|c| at(c, ITERATIONS as f64) < 1.0) {
-            "It comes out."
-        } else {
-            "It does not come out:\nthe truth has sharp edges that the lenslets do not resolve, and Richardson–Lucy goes on sharpening for long after these iterations."
-        },
-    )
-    .ok();
-    let name = format!("of iterate {end:.0}");
-    let series = vec![("of the truth", SeriesStyle::Line, truth), (name.as_str(), SeriesStyle::Line, last)];
+    let curve = |value: &dyn Fn(&Convergence) -> f64| -> Vec<(f64, f64)> {
+        let points = results.convergence.iter().map(|c| (c.iterations as f64, 100.0 * value(c)));
+        // an iterate's distance to itself is no news
+        points.filter(|p| p.1 > 0.0).collect()
+    };
+    let end = results.convergence.last().map_or(0, |c| c.iterations);
+    let name = format!("of iterate {end}");
+    let curves = [
+        ("of the truth", curve(&|c| c.truth)),
+        ("of the truth, images by the same projector", curve(&|c| c.crime[0])),
+        (name.as_str(), curve(&|c| c.last)),
+        ("change by one iteration", curve(&|c| c.change)),
+        ("of the images", curve(&|c| c.residual)),
+    ];
+    text.push_str("### Figure 20: convergence\n\n‖gⁿ − g‖/‖g‖ in % of a bead at 20 µm, 30°, `virtual`, by what g may be. *Change*: ‖gⁿ − gⁿ⁻¹‖/‖gⁿ‖. *Images*: ‖Hgⁿ⁻¹ − f‖/‖f‖. *Own projector*: images made by the projector of the reconstruction, the inverse crime.\n\n");
+    let percent = |v: f64| if v == 0.0 { "–".to_owned() } else { format!("{:.2}", 100.0 * v) };
+    let rows: Vec<Vec<String>> = results
+        .convergence
+        .iter()
+        .map(|c| {
+            let values = [c.truth, c.last, c.change, c.residual, c.crime[0], c.crime[1]];
+            [vec![c.iterations.to_string()], values.map(percent).to_vec()].concat()
+        })
+        .collect();
+    let head =
+        ["n", "truth", &format!("iterate {end}"), "change", "images", "own projector: truth", "images"];
+    text.push_str(&table(&head, &rows));
+    text.push('\n');
+    let series = curves.map(|(name, curve)| (name, SeriesStyle::Line, curve)).to_vec();
     figures.push(("light-fig20".into(), chart("Convergence", "iteration", "‖gⁿ − g‖/‖g‖, %", series, None)?));
     text.push_str(&row_of(&[("light-fig20", "Convergence")]).replace("98%", "49%"));
     Ok(())
