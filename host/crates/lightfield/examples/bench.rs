@@ -1,7 +1,7 @@
 //! Speed of the light-field reconstruction; one JSON line for each measurement. Used by
 //! `cargo xtask bench lightfield`.
 //!
-//! Arguments: what is to be measured (`psf`, `rl`, `isra`, `dlfm`, `size`, `psf-plane`), threads, repeats.
+//! Arguments: what is to be measured (`psf`, `rl`, `isra`, `dlfm`, `size`, `psf-plane`), threads, repeats, and the only case to time.
 
 use daic_lightfield::{
     DiffractionModel, Frame, Grating, Method, Model, Normal, Operator, OperatorSettings, Order, Oversampling,
@@ -11,22 +11,8 @@ use std::time::Instant;
 
 /// Seconds of processor time of this process.
 fn cpu() -> f64 {
-    #[cfg(target_os = "linux")]
-    {
-        // utime and stime, fields 14 and 15, in ticks of 10 ms, would be too coarse
-        let text = std::fs::read_to_string("/proc/self/schedstat").unwrap_or_default();
-        let main: f64 = text.split_whitespace().next().and_then(|v| v.parse().ok()).unwrap_or(f64::NAN);
-        let mut all = 0.0;
-        for entry in std::fs::read_dir("/proc/self/task").into_iter().flatten().flatten() {
-            let text = std::fs::read_to_string(entry.path().join("schedstat")).unwrap_or_default();
-            all += text.split_whitespace().next().and_then(|v| v.parse::<f64>().ok()).unwrap_or(0.0);
-        }
-        f64::max(all, main) * 1e-9
-    }
-    #[cfg(not(target_os = "linux"))]
-    {
-        f64::NAN
-    }
+    let t = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+    t.tv_sec as f64 + 1e-9 * t.tv_nsec as f64
 }
 
 fn median(mut v: Vec<f64>) -> (f64, f64, f64) {
@@ -71,6 +57,9 @@ struct Case<'a> {
 }
 
 fn time(case: &Case<'_>, repeats: usize) {
+    if std::env::args().nth(4).is_some_and(|only| only != case.name) {
+        return;
+    }
     let m = &case.model;
     let shape = m.operator.volume_shape();
     let g = volume(shape.iter().product());

@@ -1,6 +1,8 @@
 //! Which vector instructions the kernels are compiled for.
 
-use fearless_simd::{Level, Simd};
+#[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+use fearless_simd::Avx2;
+use fearless_simd::{Level, Simd, SimdBase};
 
 /// Lanes of the vectors used: 8 numbers of 32 bits.
 pub(crate) const LANES: usize = 8;
@@ -38,5 +40,75 @@ pub(crate) fn run<K: Kernel>(level: Level, kernel: K) -> K::Output {
     #[cfg(not(any(target_arch = "x86", target_arch = "x86_64")))]
     {
         fearless_simd::dispatch!(level, s => kernel.run(s))
+    }
+}
+
+/// The lanes in reverse order.
+#[inline(always)]
+pub(crate) fn reversed<S: Simd>(s: S, v: V<S>) -> V<S> {
+    // known when a kernel is compiled
+    #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+    if let Some(avx2) = s.level().as_avx2() {
+        let lanes: [f32; LANES] = v.into();
+        let lanes: [f32; LANES] = permuted(avx2, V::from_slice(avx2, &lanes)).into();
+        return V::from_slice(s, &lanes);
+    }
+    s.reverse_f32x8(v)
+}
+
+#[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+fearless_simd::kernel! {
+    fn permuted(s: Avx2, v: V<Avx2>) -> V<Avx2> {
+        use fearless_simd::SimdFrom;
+        #[cfg(target_arch = "x86")]
+        use std::arch::x86::{_mm256_permutevar8x32_ps, _mm256_setr_epi32};
+        #[cfg(target_arch = "x86_64")]
+        use std::arch::x86_64::{_mm256_permutevar8x32_ps, _mm256_setr_epi32};
+        V::simd_from(s, _mm256_permutevar8x32_ps(v.into(), _mm256_setr_epi32(7, 6, 5, 4, 3, 2, 1, 0)))
+    }
+}
+
+/// Rows of eight vectors as columns.
+#[inline(always)]
+pub(crate) fn transposed<S: Simd>(s: S, mut rows: [V<S>; LANES]) -> [V<S>; LANES] {
+    // three perfect shuffles exchange the three bits of the vector's number with those of the lane's
+    for _ in 0..3 {
+        let from = rows;
+        for i in 0..LANES / 2 {
+            (rows[2 * i], rows[2 * i + 1]) = s.interleave_f32x8(from[i], from[i + LANES / 2]);
+        }
+    }
+    rows
+}
+
+/// Eight numbers of half precision. Numbers below the smallest normal one must have been made zero.
+#[inline(always)]
+pub(crate) fn widen<S: Simd>(s: S, halves: [u16; LANES]) -> V<S> {
+    // known when a kernel is compiled
+    #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+    if let Some(avx2) = s.level().as_avx2() {
+        let wide: [f32; LANES] = f16c(avx2, &halves).into();
+        return V::from_slice(s, &wide);
+    }
+    // exponents are re-biased by the multiplication: 2^(127−15)
+    let rebias = f32::from_bits((127 + 112) << 23);
+    let wide = halves.map(|h| {
+        let bits = u32::from(h);
+        let magnitude = f32::from_bits((bits & 0x7fff) << 13) * rebias;
+        f32::from_bits(magnitude.to_bits() | ((bits & 0x8000) << 16))
+    });
+    V::from_slice(s, &wide)
+}
+
+#[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+fearless_simd::kernel! {
+    fn f16c(s: Avx2, halves: &[u16; LANES]) -> V<Avx2> {
+        use fearless_simd::{SimdBase, SimdFrom, u16x8};
+        #[cfg(target_arch = "x86")]
+        use std::arch::x86::{__m128i, _mm256_cvtph_ps};
+        #[cfg(target_arch = "x86_64")]
+        use std::arch::x86_64::{__m128i, _mm256_cvtph_ps};
+        let packed: __m128i = u16x8::from_slice(s, halves).into();
+        V::simd_from(s, _mm256_cvtph_ps(packed))
     }
 }

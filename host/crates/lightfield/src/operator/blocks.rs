@@ -8,6 +8,7 @@
 use super::basis::Cell;
 use super::gemm::{Block, Element};
 use super::symmetry::Symmetries;
+use crate::simd::LANES;
 use rayon::prelude::*;
 
 /// What the symmetry allows.
@@ -56,18 +57,23 @@ struct Step {
     conjugate_x: bool,
 }
 
-/// [`Step`] channel by channel: where real and imaginary part come from in (re…, im…), and with which sign.
+/// [`Step`] channel by channel.
 #[derive(Debug, Clone)]
 pub(crate) struct Table {
-    pub(crate) from: Vec<[u32; 2]>,
-    pub(crate) sign: Vec<[f32; 2]>,
+    /// The channel from which each comes, unless it is its own.
+    pub(crate) from: Option<Vec<u32>>,
+    /// Cosine a and sine b of a turn by a multiple of 90°, for all padded channels: re′ = a re + b im,
+    /// im′ = ±(a im − b re).
+    pub(crate) turn: [Vec<f32>; 2],
+    /// The sign of im′.
+    pub(crate) sign: f32,
 }
 
 impl Table {
-    /// `padded`: where the imaginary parts begin.
     fn new(cell: &Cell, padded: usize, real: bool, step: Step) -> Self {
-        let (mut from, mut sign) = (Vec::new(), Vec::new());
-        for c in 0..cell.channels() {
+        let mut from: Vec<u32> = (0..padded as u32).collect();
+        let mut turn = [(); 2].map(|()| vec![0f32; padded]);
+        for (c, from) in from.iter_mut().enumerate().take(cell.channels()) {
             let (y, x, i) = cell.split(c);
             let (mut sy, mut sx) = if step.exchange { (x, y) } else { (y, x) };
             let mut f = 1.0;
@@ -83,18 +89,16 @@ impl Table {
                     sx = cell.n[1] - 1 - sx;
                 }
             }
-            let source = cell.at(sy, sx, i) as u32;
-            let imaginary = source + padded as u32;
+            *from = cell.at(sy, sx, i) as u32;
             if real && cell.parity(0, y) * cell.parity(1, x) < 0.0 {
                 // times −i
-                from.push([imaginary, source]);
-                sign.push([f, -f]);
+                turn[1][c] = f;
             } else {
-                from.push([source, imaginary]);
-                sign.push([f, if step.conjugate_x { -f } else { f }]);
+                turn[0][c] = f;
             }
         }
-        Self { from, sign }
+        let moved = from.iter().enumerate().any(|(c, f)| c as u32 != *f);
+        Self { from: moved.then_some(from), turn, sign: if step.conjugate_x { -1.0 } else { 1.0 } }
     }
 }
 
@@ -120,8 +124,6 @@ pub(crate) struct Orbits {
     /// (orbit, member) of frequency [kx][ky].
     pub(crate) place: Vec<(u32, u32)>,
     steps: Vec<Step>,
-    /// Most members of an orbit.
-    pub(crate) slots: usize,
 }
 
 impl Orbits {
@@ -164,8 +166,7 @@ impl Orbits {
                 orbits.push(orbit);
             }
         }
-        let slots = orbits.iter().map(|o| o.members.len()).max().unwrap_or(1);
-        Self { orbits, place, steps, slots }
+        Self { orbits, place, steps }
     }
 
     pub(crate) fn tables(&self, cell: &Cell, padded: usize, real: bool) -> Vec<Table> {
@@ -312,6 +313,12 @@ impl Kernel {
     }
 }
 
+/// Shape of a stored block of `rows` × `columns` numbers; imaginary parts lie below real ones, from the next
+/// multiple of the lanes on.
+pub(crate) fn block_of(rows: usize, columns: usize, real: bool) -> Block {
+    Block { rows: if real { rows } else { rows.next_multiple_of(LANES) + rows }, columns }
+}
+
 /// Packs blocks given as (real parts, imaginary parts), `rows` × `columns`, into panels.
 pub(crate) fn pack<T: Element>(
     matrices: &[(Vec<f32>, Vec<f32>)],
@@ -320,7 +327,8 @@ pub(crate) fn pack<T: Element>(
     grid: [usize; 2],
     real: bool,
 ) -> Blocks<T> {
-    let block = Block::new(if real { rows } else { 2 * rows }, columns);
+    let block = block_of(rows, columns, real);
+    let below = block.rows - rows;
     let mut scale = 1.0 / (grid[0] * grid[1]) as f32;
     let mut factor = 1.0f32;
     if T::BYTES == 2 {
@@ -338,7 +346,7 @@ pub(crate) fn pack<T: Element>(
             for column in 0..columns {
                 out[block.index(row, column)] = T::of(factor * re[row * columns + column]);
                 if !real {
-                    out[block.index(rows + row, column)] = T::of(factor * im[row * columns + column]);
+                    out[block.index(below + row, column)] = T::of(factor * im[row * columns + column]);
                 }
             }
         }

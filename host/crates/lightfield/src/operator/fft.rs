@@ -1,9 +1,11 @@
 //! Fourier transforms over the lenslet grid, vectorised over the channels of a cell.
 //!
-//! Stockham's autosort form with radices 2, 3, 4 and 5; no bit reversal, two buffers.
+//! Stockham's autosort form with radices 2, 3, 4, 5 and 8; no bit reversal, two buffers. The first stage reads
+//! its numbers where they lie.
 
 use crate::simd::{LANES, V};
 use fearless_simd::prelude::*;
+use prefetch_index::prefetch_index;
 
 /// Length and twiddle factors of a transform.
 #[derive(Debug, Clone)]
@@ -115,40 +117,107 @@ fn dft5<S: Simd, const INVERSE: bool>(s: S, x: [C<S>; 5]) -> [C<S>; 5] {
     [x[0].plus(a).plus(b), p.plus(u), q.plus(v), q.minus(v), p.minus(u)]
 }
 
+/// An offset that stands for zero.
+pub(crate) const NOTHING: usize = usize::MAX;
+
+/// Where the complex numbers of a transform lie.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Source<'a> {
+    pub(crate) values: &'a [f32],
+    /// Of the real part of each number, or [`NOTHING`].
+    pub(crate) offsets: &'a [usize],
+    /// From the real to the imaginary part.
+    pub(crate) imaginary: usize,
+}
+
+impl Source<'_> {
+    #[inline(always)]
+    fn get<S: Simd>(&self, s: S, i: usize, channel: usize) -> C<S> {
+        let at = self.offsets[i];
+        if at == NOTHING {
+            return C::zero(s);
+        }
+        let at = at + channel;
+        // the next line of the cache, for the groups of lanes to come
+        prefetch_index(self.values, at + 2 * LANES);
+        prefetch_index(self.values, at + self.imaginary + 2 * LANES);
+        let re = V::from_slice(s, &self.values[at..at + LANES]);
+        let at = at + self.imaginary;
+        C { re, im: V::from_slice(s, &self.values[at..at + LANES]) }
+    }
+}
+
+#[inline(always)]
+fn dft8<S: Simd, const INVERSE: bool>(s: S, x: [C<S>; 8]) -> [C<S>; 8] {
+    let even = dft4::<S, INVERSE>([x[0], x[2], x[4], x[6]]);
+    let odd = dft4::<S, INVERSE>([x[1], x[3], x[5], x[7]]);
+    let half = V::splat(s, std::f32::consts::FRAC_1_SQRT_2);
+    // odd[1] (1 − i)/√2, odd[2] (−i), odd[3] (−1 − i)/√2, conjugated for the inverse
+    let (a, b) = (odd[1].turn::<INVERSE>(), odd[3].turn::<INVERSE>());
+    let odd = [odd[0], odd[1].plus(a).scaled(half), odd[2].turn::<INVERSE>(), b.minus(odd[3]).scaled(half)];
+    [
+        even[0].plus(odd[0]),
+        even[1].plus(odd[1]),
+        even[2].plus(odd[2]),
+        even[3].plus(odd[3]),
+        even[0].minus(odd[0]),
+        even[1].minus(odd[1]),
+        even[2].minus(odd[2]),
+        even[3].minus(odd[3]),
+    ]
+}
+
 /// Complex numbers of one group of lanes.
 pub(crate) const PART: usize = 2 * LANES;
 
 #[inline(always)]
-fn get<S: Simd>(s: S, buffer: &[f32], i: usize) -> C<S> {
-    let part = &buffer[i * PART..][..PART];
+fn get<S: Simd>(s: S, part: &[f32; PART]) -> C<S> {
     C { re: V::from_slice(s, &part[..LANES]), im: V::from_slice(s, &part[LANES..]) }
 }
 
 #[inline(always)]
-fn put<S: Simd>(buffer: &mut [f32], i: usize, c: C<S>) {
-    let part = &mut buffer[i * PART..][..PART];
+fn put<S: Simd>(part: &mut [f32; PART], c: C<S>) {
     c.re.store_slice(&mut part[..LANES]);
     c.im.store_slice(&mut part[LANES..]);
+}
+
+/// Radices of a length, in the order of the stages.
+fn radices(mut n: usize) -> Vec<usize> {
+    let mut out = Vec::new();
+    for f in [5, 3] {
+        while n.is_multiple_of(f) {
+            out.push(f);
+            n /= f;
+        }
+    }
+    while n > 1 {
+        let r = match n {
+            8 | 32.. => 8,
+            4.. => 4,
+            _ => 2,
+        };
+        out.push(r);
+        n /= r;
+    }
+    out
 }
 
 impl Plan {
     /// `n` must be a [`good_length`].
     pub(crate) fn new(n: usize) -> Self {
         let (mut rest, mut stride, mut stages) = (n, 1, Vec::new());
-        for radix in [5, 4, 3, 2] {
-            while rest.is_multiple_of(radix) {
-                let m = rest / radix;
-                let twiddles = (0..m)
-                    .flat_map(|p| (1..radix).map(move |k| (p * k) as f64 / (radix * m) as f64))
-                    .map(|turn| {
-                        let (sin, cos) = (-std::f64::consts::TAU * turn).sin_cos();
-                        [cos as f32, sin as f32]
-                    })
-                    .collect();
-                stages.push(Stage { radix, m, stride, twiddles });
-                rest = m;
-                stride *= radix;
-            }
+        for radix in radices(n) {
+            let m = rest / radix;
+            let twiddles = (0..m)
+                .flat_map(|p| (1..radix).map(move |k| (p * k) as f64 / (radix * m) as f64))
+                .map(|turn| {
+                    let (sin, cos) = (-std::f64::consts::TAU * turn).sin_cos();
+                    [cos as f32, sin as f32]
+                })
+                .collect();
+            stages.push(Stage { radix, m, stride, twiddles });
+            rest = m;
+            stride *= radix;
         }
         Self { n, stages }
     }
@@ -158,39 +227,44 @@ impl Plan {
         2 * self.n * PART
     }
 
-    /// Transforms what `load` gives; the result lies in the first half of `scratch`, complex number by
-    /// complex number. No scaling.
-    #[inline(always)]
+    /// Transforms the lanes of `source` from `channel` on; the result lies in the first half of `scratch`,
+    /// complex number by complex number ([`result`]). No scaling.
+    ///
+    /// A function of its own, as every caller's copy would take long to compile.
+    #[inline(never)]
     pub(crate) fn run<S: Simd, const INVERSE: bool>(
         &self,
         s: S,
         scratch: &mut [f32],
-        load: impl Fn(usize) -> C<S>,
+        source: Source<'_>,
+        channel: usize,
     ) {
-        let scratch = &mut scratch[..self.scratch()];
-        let (result, other) = scratch.split_at_mut(self.n * PART);
-        // the last stage writes into `result`
-        let input = if self.stages.len().is_multiple_of(2) { result } else { other };
-        for i in 0..self.n {
-            put(input, i, load(i));
-        }
-        self.stages_on::<S, INVERSE>(s, scratch);
-    }
-
-    /// All stages; a function of its own, as every caller's copy would take long to compile.
-    #[inline(never)]
-    fn stages_on<S: Simd, const INVERSE: bool>(&self, s: S, scratch: &mut [f32]) {
         s.vectorize(
             #[inline(always)]
             || {
-                let (result, other) = scratch.split_at_mut(self.n * PART);
-                let count = self.stages.len();
-                for (i, stage) in self.stages.iter().enumerate() {
-                    if (count - i) % 2 == 1 {
-                        stage.run::<S, INVERSE>(s, other, result);
-                    } else {
-                        stage.run::<S, INVERSE>(s, result, other);
-                    }
+                let parts = scratch.as_chunks_mut::<PART>().0;
+                let (result, other) = parts[..2 * self.n].split_at_mut(self.n);
+                let Some((first, rest)) = self.stages.split_first() else {
+                    put(&mut result[0], source.get(s, 0, channel));
+                    return;
+                };
+                // the last stage writes into `result`
+                let (mut from, mut to) =
+                    if rest.len().is_multiple_of(2) { (other, result) } else { (result, other) };
+                first.run::<S, INVERSE>(
+                    s,
+                    #[inline(always)]
+                    |i| source.get(s, i, channel),
+                    to,
+                );
+                for stage in rest {
+                    (from, to) = (to, from);
+                    stage.run::<S, INVERSE>(
+                        s,
+                        #[inline(always)]
+                        |i| get(s, &from[i]),
+                        to,
+                    );
                 }
             },
         );
@@ -200,12 +274,12 @@ impl Plan {
 /// Complex number `i` of a result of [`Plan::run`].
 #[inline(always)]
 pub(crate) fn result<S: Simd>(s: S, scratch: &[f32], i: usize) -> C<S> {
-    get(s, scratch, i)
+    get(s, &scratch.as_chunks::<PART>().0[i])
 }
 
 impl Stage {
     #[inline(always)]
-    fn run<S: Simd, const INVERSE: bool>(&self, s: S, from: &[f32], to: &mut [f32]) {
+    fn run<S: Simd, const INVERSE: bool>(&self, s: S, from: impl Fn(usize) -> C<S>, to: &mut [[f32; PART]]) {
         match self.radix {
             2 => self.pass::<S, 2, INVERSE>(
                 s,
@@ -228,12 +302,19 @@ impl Stage {
                 #[inline(always)]
                 |x| dft4::<S, INVERSE>(x),
             ),
-            _ => self.pass::<S, 5, INVERSE>(
+            5 => self.pass::<S, 5, INVERSE>(
                 s,
                 from,
                 to,
                 #[inline(always)]
                 |x| dft5::<S, INVERSE>(s, x),
+            ),
+            _ => self.pass::<S, 8, INVERSE>(
+                s,
+                from,
+                to,
+                #[inline(always)]
+                |x| dft8::<S, INVERSE>(s, x),
             ),
         }
     }
@@ -242,25 +323,25 @@ impl Stage {
     fn pass<S: Simd, const R: usize, const INVERSE: bool>(
         &self,
         s: S,
-        from: &[f32],
-        to: &mut [f32],
+        from: impl Fn(usize) -> C<S>,
+        to: &mut [[f32; PART]],
         dft: impl Fn([C<S>; R]) -> [C<S>; R],
     ) {
         for p in 0..self.m {
             for q in 0..self.stride {
                 let mut x = [C::zero(s); R];
                 for k in 0..R {
-                    x[k] = get(s, from, q + self.stride * (p + self.m * k));
+                    x[k] = from(q + self.stride * (p + self.m * k));
                 }
                 let y = dft(x);
-                put(to, q + self.stride * R * p, y[0]);
+                put(&mut to[q + self.stride * R * p], y[0]);
                 for k in 1..R {
                     let value = if p == 0 {
                         y[k]
                     } else {
                         y[k].times::<INVERSE>(s, self.twiddles[p * (R - 1) + k - 1])
                     };
-                    put(to, q + self.stride * (R * p + k), value);
+                    put(&mut to[q + self.stride * (R * p + k)], value);
                 }
             }
         }

@@ -1,13 +1,24 @@
 //! Products of a stored block with up to eight real vectors.
 //!
-//! A block of `rows` × `columns` is stored in panels of `T::height()` rows: [panel][column][row]. The vectors
-//! lie interleaved, eight numbers for each index, so that both directions read the same storage in order.
+//! A block of `rows` × `columns` is stored in panels of eight rows: [panel][column][row]. The vectors lie
+//! interleaved, eight numbers for each index, so that both directions read the same storage once and in order.
+//! Reading it is what takes time: it is asked for ahead of its use.
 
-use crate::simd::{LANES, V};
+use crate::simd::{LANES, V, widen};
 use fearless_simd::prelude::*;
+use prefetch_index::prefetch_index;
 
 /// Vectors that one call takes.
 pub(crate) const VECTORS: usize = 8;
+/// How far ahead of its use storage is asked for, in bytes; from 2 to 8 KiB are equally good.
+const AHEAD: usize = 4096;
+/// Columns between two requests.
+const GROUP: usize = 4;
+/// Columns of a panel that are summed at a time in the transposed product: with the eight rows all registers
+/// of AVX2.
+const SUMS: usize = 6;
+/// Columns that are converted at a time.
+const CONVERTED: usize = 4 * SUMS;
 
 /// How a block's numbers are stored.
 pub(crate) trait Element: Copy + Send + Sync + Default + 'static {
@@ -15,8 +26,10 @@ pub(crate) trait Element: Copy + Send + Sync + Default + 'static {
     const BYTES: usize;
     /// Nearest storable number.
     fn of(value: f32) -> Self;
-    /// The numbers of a panel as 32-bit numbers, in `scratch` if they have to be converted.
-    fn decode<'a>(panel: &'a [Self], scratch: &'a mut [f32]) -> &'a [f32];
+    /// Eight numbers.
+    fn lanes<S: Simd>(s: S, from: &[Self; LANES]) -> V<S>;
+    /// The numbers as 32-bit numbers, in `scratch` if they have to be converted.
+    fn plain<'a, S: Simd>(s: S, from: &'a [Self], scratch: &'a mut [f32]) -> &'a [f32];
 }
 
 impl Element for f32 {
@@ -27,8 +40,13 @@ impl Element for f32 {
     }
 
     #[inline(always)]
-    fn decode<'a>(panel: &'a [Self], _: &'a mut [f32]) -> &'a [f32] {
-        panel
+    fn lanes<S: Simd>(s: S, from: &[Self; LANES]) -> V<S> {
+        V::from_slice(s, from)
+    }
+
+    #[inline(always)]
+    fn plain<'a, S: Simd>(_: S, from: &'a [Self], _: &'a mut [f32]) -> &'a [f32] {
+        from
     }
 }
 
@@ -45,55 +63,38 @@ impl Element for Half {
     }
 
     #[inline(always)]
-    fn decode<'a>(panel: &'a [Self], scratch: &'a mut [f32]) -> &'a [f32] {
-        let out = &mut scratch[..panel.len()];
-        // exponents are re-biased by the multiplication: 2^(127−15)
-        let rebias = f32::from_bits((127 + 112) << 23);
-        for (o, h) in out.iter_mut().zip(panel) {
-            let bits = u32::from(h.0);
-            let magnitude = f32::from_bits((bits & 0x7fff) << 13) * rebias;
-            *o = f32::from_bits(magnitude.to_bits() | ((bits & 0x8000) << 16));
+    fn lanes<S: Simd>(s: S, from: &[Self; LANES]) -> V<S> {
+        widen(s, from.map(|h| h.0))
+    }
+
+    #[inline(always)]
+    fn plain<'a, S: Simd>(s: S, from: &'a [Self], scratch: &'a mut [f32]) -> &'a [f32] {
+        for (h, o) in from.as_chunks::<LANES>().0.iter().zip(scratch.as_chunks_mut::<LANES>().0) {
+            Self::lanes(s, h).store_slice(o);
         }
-        out
+        &scratch[..from.len()]
     }
 }
 
-/// Shape of a block and its panels.
+/// Shape of a block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Block {
     pub(crate) rows: usize,
     pub(crate) columns: usize,
-    /// Vectors of lanes in a panel: 3, or 2 where that pads less.
-    pub(crate) tall: usize,
 }
 
 impl Block {
-    pub(crate) fn new(rows: usize, columns: usize) -> Self {
-        let padded = |tall: usize| rows.next_multiple_of(tall * LANES);
-        Self { rows, columns, tall: if padded(3) <= padded(2) { 3 } else { 2 } }
-    }
-
-    pub(crate) fn height(&self) -> usize {
-        self.tall * LANES
-    }
-
     pub(crate) fn padded_rows(&self) -> usize {
-        self.rows.next_multiple_of(self.height())
+        self.rows.next_multiple_of(LANES)
     }
 
     pub(crate) fn len(&self) -> usize {
         self.padded_rows() * self.columns
     }
 
-    /// Numbers of a panel.
-    pub(crate) fn panel(&self) -> usize {
-        self.height() * self.columns
-    }
-
     /// Where (row, column) lies.
     pub(crate) fn index(&self, row: usize, column: usize) -> usize {
-        let h = self.height();
-        (row / h * self.columns + column) * h + row % h
+        (row / LANES * self.columns + column) * LANES + row % LANES
     }
 
     /// y = A x. `x`: [column][8]; `y`: [8][padded row], of which `vectors` are computed.
@@ -105,106 +106,133 @@ impl Block {
         x: &[f32],
         y: &mut [f32],
         vectors: usize,
-        scratch: &mut [f32],
     ) {
-        let stride = self.padded_rows();
-        for (p, panel) in a.chunks_exact(self.panel()).enumerate() {
-            let panel = T::decode(panel, scratch);
-            let mut j = 0;
-            while j < vectors {
-                let at = j * stride + p * self.height();
-                match (self.tall, vectors - j) {
-                    (3, 1 | 2) => tile::<S, 3, 2>(s, panel, x, j, &mut y[at..], stride),
-                    (3, _) => tile::<S, 3, 4>(s, panel, x, j, &mut y[at..], stride),
-                    (_, 1 | 2) => tile::<S, 2, 2>(s, panel, x, j, &mut y[at..], stride),
-                    _ => tile::<S, 2, 4>(s, panel, x, j, &mut y[at..], stride),
-                }
-                j += 4;
-            }
+        let x = &x[..self.columns * VECTORS];
+        match vectors {
+            1 | 2 => self.tiles::<S, T, 2, 4>(s, a, x, y),
+            3 | 4 => self.tiles::<S, T, 4, 2>(s, a, x, y),
+            _ => self.tiles::<S, T, 8, 1>(s, a, x, y),
         }
     }
 
-    /// y = Aᵀ x. `x`: [padded row][8]; `y`: [column][8], overwritten.
+    /// All rows times `N` vectors, `P` panels at a time: enough sums that additions need not wait for each
+    /// other. Each sum has one order, whatever `N` and `P`.
     #[inline(always)]
-    pub(crate) fn multiply_transposed<S: Simd, T: Element>(
+    fn tiles<S: Simd, T: Element, const N: usize, const P: usize>(
         &self,
         s: S,
         a: &[T],
         x: &[f32],
         y: &mut [f32],
-        scratch: &mut [f32],
     ) {
-        let h = self.height();
-        y[..self.columns * VECTORS].fill(0.0);
-        for (panel, x) in a.chunks_exact(self.panel()).zip(x.chunks_exact(h * VECTORS)) {
-            let panel = T::decode(panel, scratch);
-            let mut c = 0;
-            while c + 12 <= self.columns {
-                columns::<S, 12>(s, &panel[c * h..][..12 * h], h, x, &mut y[c * VECTORS..][..12 * VECTORS]);
-                c += 12;
+        let stride = self.padded_rows();
+        let panel = LANES * self.columns;
+        let together = a.chunks_exact(P * panel);
+        let (rest, done) = (together.remainder(), together.len() * P);
+        for (p, a) in together.enumerate() {
+            tile::<S, T, N, P>(s, a, x, &mut y[p * P * LANES..], stride);
+        }
+        for (p, a) in rest.chunks_exact(panel).enumerate() {
+            tile::<S, T, N, 1>(s, a, x, &mut y[(done + p) * LANES..], stride);
+        }
+    }
+
+    /// y = Aᵀ x. `x`: [padded row][8]; `y`: [column][8], overwritten.
+    #[inline(always)]
+    pub(crate) fn multiply_transposed<S: Simd, T: Element>(&self, s: S, a: &[T], x: &[f32], y: &mut [f32]) {
+        let y = &mut y[..self.columns * VECTORS];
+        y.fill(0.0);
+        let mut scratch = [0f32; CONVERTED * LANES];
+        let panels = a.chunks_exact(LANES * self.columns);
+        for (panel, x) in panels.zip(x.as_chunks::<{ LANES * VECTORS }>().0) {
+            let mut rows = [V::splat(s, 0.0); LANES];
+            for (row, x) in rows.iter_mut().zip(x.as_chunks::<VECTORS>().0) {
+                *row = V::from_slice(s, x);
             }
-            while c + 3 <= self.columns {
-                columns::<S, 3>(s, &panel[c * h..][..3 * h], h, x, &mut y[c * VECTORS..][..3 * VECTORS]);
-                c += 3;
-            }
-            while c < self.columns {
-                columns::<S, 1>(s, &panel[c * h..][..h], h, x, &mut y[c * VECTORS..][..VECTORS]);
-                c += 1;
+            let parts = panel.chunks(CONVERTED * LANES).zip(y.chunks_mut(CONVERTED * VECTORS));
+            for (a, y) in parts {
+                ahead(a);
+                let plain = T::plain(s, a, &mut scratch);
+                let (groups, rest) = plain.as_chunks::<{ SUMS * LANES }>();
+                let (y_groups, y_rest) = y.as_chunks_mut::<{ SUMS * VECTORS }>();
+                for (a, y) in groups.iter().zip(y_groups) {
+                    columns::<S, SUMS>(s, a, &rows, y);
+                }
+                for (a, y) in rest.chunks_exact(LANES).zip(y_rest.chunks_exact_mut(VECTORS)) {
+                    columns::<S, 1>(s, a, &rows, y);
+                }
             }
         }
     }
 }
 
-/// One panel, `T` lanes-high, times `N` vectors from the j-th on.
+/// Asks for what lies [`AHEAD`] of `part`.
 #[inline(always)]
-fn tile<S: Simd, const T: usize, const N: usize>(
+fn ahead<T: Element>(part: &[T]) {
+    const LINE: usize = 64;
+    for at in (0..part.len()).step_by(LINE / T::BYTES) {
+        prefetch_index(part, at + AHEAD / T::BYTES);
+    }
+}
+
+/// `P` panels times `N` vectors.
+#[inline(always)]
+fn tile<S: Simd, T: Element, const N: usize, const P: usize>(
     s: S,
-    panel: &[f32],
+    a: &[T],
     x: &[f32],
-    j: usize,
     y: &mut [f32],
     stride: usize,
 ) {
-    let mut sum = [[V::splat(s, 0.0); N]; T];
-    for (a, x) in panel.chunks_exact(T * LANES).zip(x.chunks_exact(VECTORS)) {
-        let mut column = [V::splat(s, 0.0); T];
-        for t in 0..T {
-            column[t] = V::from_slice(s, &a[t * LANES..][..LANES]);
-        }
-        let x = &x[j..j + N];
-        for n in 0..N {
-            let b = V::splat(s, x[n]);
-            for t in 0..T {
-                sum[t][n] = column[t].mul_add(b, sum[t][n]);
+    let panel = a.len() / P;
+    let mut columns: [&[[T; LANES]]; P] = [&[]; P];
+    for (p, c) in columns.iter_mut().enumerate() {
+        *c = a[p * panel..(p + 1) * panel].as_chunks::<LANES>().0;
+    }
+    let mut sum = [[V::splat(s, 0.0); N]; P];
+    let (groups, rest) = x.as_chunks::<{ GROUP * VECTORS }>();
+    for (g, x) in groups.iter().enumerate() {
+        for p in 0..P {
+            let a = &columns[p][g * GROUP..(g + 1) * GROUP];
+            ahead(a.as_flattened());
+            for (a, x) in a.iter().zip(x.as_chunks::<VECTORS>().0) {
+                add::<S, T, N>(s, a, x, &mut sum[p]);
             }
         }
     }
-    for n in 0..N {
-        for t in 0..T {
-            sum[t][n].store_slice(&mut y[n * stride + t * LANES..][..LANES]);
+    for p in 0..P {
+        for (a, x) in columns[p][groups.len() * GROUP..].iter().zip(rest.as_chunks::<VECTORS>().0) {
+            add::<S, T, N>(s, a, x, &mut sum[p]);
+        }
+        for n in 0..N {
+            sum[p][n].store_slice(&mut y[n * stride + p * LANES..][..LANES]);
         }
     }
 }
 
-/// `N` columns of a panel, transposed, times all eight vectors, added to y.
+/// Adds a column of a panel times the first `N` of eight numbers.
 #[inline(always)]
-fn columns<S: Simd, const N: usize>(s: S, a: &[f32], h: usize, x: &[f32], y: &mut [f32]) {
+fn add<S: Simd, T: Element, const N: usize>(s: S, a: &[T; LANES], x: &[f32; VECTORS], sum: &mut [V<S>; N]) {
+    let a = T::lanes(s, a);
+    for n in 0..N {
+        sum[n] = a.mul_add(V::splat(s, x[n]), sum[n]);
+    }
+}
+
+/// `N` columns of a panel, transposed, times its eight rows of all vectors, added to y.
+#[inline(always)]
+fn columns<S: Simd, const N: usize>(s: S, a: &[f32], rows: &[V<S>; LANES], y: &mut [f32]) {
+    let (a, y) = (&a.as_chunks::<LANES>().0[..N], &mut y.as_chunks_mut::<VECTORS>().0[..N]);
     let mut sum = [V::splat(s, 0.0); N];
     for n in 0..N {
-        sum[n] = V::from_slice(s, &y[n * VECTORS..][..VECTORS]);
+        sum[n] = V::from_slice(s, &y[n]);
     }
-    // columns one by one as slices of equal length, which spares checks
-    let mut column: [&[f32]; N] = [&[]; N];
-    for n in 0..N {
-        column[n] = &a[n * h..][..h];
-    }
-    for (r, x) in x[..h * VECTORS].chunks_exact(VECTORS).enumerate() {
-        let x = V::from_slice(s, x);
+    for r in 0..LANES {
         for n in 0..N {
-            sum[n] = V::splat(s, column[n][r]).mul_add(x, sum[n]);
+            sum[n] = V::splat(s, a[n][r]).mul_add(rows[r], sum[n]);
         }
     }
     for n in 0..N {
-        sum[n].store_slice(&mut y[n * VECTORS..][..VECTORS]);
+        sum[n].store_slice(&mut y[n]);
     }
 }

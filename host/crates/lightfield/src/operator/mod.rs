@@ -1,11 +1,13 @@
 //! Projections H g and back-projections Hᵀ f.
 
+mod axes;
 mod basis;
 mod blocks;
 mod direct;
 mod engine;
 mod fft;
 mod gemm;
+mod multiply;
 mod normal;
 mod symmetry;
 mod tiles;
@@ -18,11 +20,11 @@ pub use symmetry::Symmetries;
 use crate::error::OperatorError;
 use crate::psf::{Psf, PsfShape};
 use basis::Cell;
-use blocks::{Blocks, Kernel, Orbits, pack};
+use blocks::{Blocks, Kernel, Orbits, block_of, pack};
 pub(crate) use engine::Spectra;
 use engine::{Engine, Port, Side};
 use fft::good_length;
-use gemm::{Block, Half};
+use gemm::Half;
 use serde::{Deserialize, Serialize};
 use tiles::Tiles;
 
@@ -198,7 +200,7 @@ fn plan(geometry: &Geometry, symmetries: Symmetries, storage: Storage) -> Memory
     let rows = shape.pixels[0] * shape.pixels[1];
     let columns = shape.voxels[0] * shape.voxels[1] * shape.planes;
     let count = orbits.orbits.len() as u64;
-    let block = Block::new(if reduction.is_real() { rows } else { 2 * rows }, columns);
+    let block = block_of(rows, columns, reduction.is_real());
     let bytes = if storage == Storage::F16 { 2 } else { 4 };
     let engine = Engine::new(grid, reduction.is_real(), orbits);
     let [volume, sensor] = sides(geometry, grid);
@@ -452,18 +454,22 @@ impl Layout {
         self.cells[0] * self.row()
     }
 
-    /// Runs `work(packed place, place in [z][y][x])`.
-    fn each(&self, mut work: impl FnMut(usize, usize)) {
+    /// Runs `work(packed place, place in [z][y][x], numbers)` for what follows each other in both.
+    fn each(&self, mut work: impl FnMut(usize, usize, usize)) {
         let [ny, nx] = self.cell.n;
         let (height, width) = (self.cells[0] * ny, self.cells[1] * nx);
         for cy in 0..self.cells[0] {
             for cx in 0..self.cells[1] {
                 let first = (cy * self.cells[1] + cx) * self.padded;
                 for y in 0..ny {
+                    let plain = (cy * ny + y) * width + cx * nx;
+                    if self.cell.inner == 1 {
+                        work(first + self.cell.at(y, 0, 0), plain, nx);
+                        continue;
+                    }
                     for x in 0..nx {
                         for i in 0..self.cell.inner {
-                            let to = (i * height + cy * ny + y) * width + cx * nx + x;
-                            work(first + self.cell.at(y, x, i), to);
+                            work(first + self.cell.at(y, x, i), i * height * width + plain + x, 1);
                         }
                     }
                 }
@@ -473,13 +479,13 @@ impl Layout {
 
     pub(crate) fn pack(&self, values: &[f32]) -> Vec<f32> {
         let mut out = vec![0f32; self.len()];
-        self.each(|packed, plain| out[packed] = values[plain]);
+        self.each(|to, from, n| out[to..to + n].copy_from_slice(&values[from..from + n]));
         out
     }
 
     pub(crate) fn unpack(&self, packed: &[f32]) -> Vec<f32> {
         let mut out = vec![0f32; self.cells[0] * self.cells[1] * self.cell.channels()];
-        self.each(|p, plain| out[plain] = packed[p]);
+        self.each(|from, to, n| out[to..to + n].copy_from_slice(&packed[from..from + n]));
         out
     }
 

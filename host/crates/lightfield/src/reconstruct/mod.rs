@@ -12,6 +12,7 @@
 //! voxels of which the sensor sees less than 1e-6 of what it sees of the best are set to zero.
 
 mod filters;
+mod kernels;
 mod passes;
 
 use crate::error::{OperatorError, ReconstructError};
@@ -228,14 +229,11 @@ pub fn reconstruct(
             w.iter_mut().zip(image).filter(|(_, v)| **v >= level).for_each(|(w, _)| *w = 0.0);
         }
     }
-    for v in images.iter_mut().flatten() {
-        *v = v.max(0.0);
-    }
-    let squares: Vec<f64> = images.iter().map(|i| i.iter().map(|v| f64::from(*v).powi(2)).sum()).collect();
+    let (squares, largest): (Vec<f64>, Vec<f32>) =
+        images.par_iter_mut().map(|image| kernels::clip(image)).unzip();
 
     let rounding = model.operator.rounding();
-    let floors: Vec<f32> =
-        images.iter().map(|i| (rounding * i.iter().copied().fold(0.0f32, f32::max)).max(FLOOR)).collect();
+    let floors: Vec<f32> = largest.iter().map(|v| (rounding * v).max(FLOOR)).collect();
     let mut passes = Passes::new(model, frames.len());
     let path = choose(model, settings, weights.is_some());
     let normal = if path == Path::Normal { model.normal.as_ref() } else { None };
@@ -321,7 +319,7 @@ pub fn reconstruct(
                 let f = &images[image][at.clone()];
                 let b = background.as_ref().map(|b| &b[image][at.clone()]);
                 let w = weights.as_ref().map(|w| &w[image][at.clone()]);
-                pixels(settings, floors[image], values, f, b, w)
+                kernels::pixels(settings, floors[image], values, [Some(f), b, w])
             });
             for (i, list) in residuals.iter_mut().enumerate() {
                 let of = i * orders..(i + 1) * orders;
@@ -333,7 +331,7 @@ pub fn reconstruct(
         let rows = passes.update(normal, &mut points, plain && !last, &|frame, row, values, x| {
             let at = row * volume.row()..(row + 1) * volume.row();
             let tv = variation.as_ref().map(|v| &v[frame][at.clone()]);
-            voxels(settings.method, values, &factors[frame][at], tv, x)
+            kernels::voxels(settings.method, values, &factors[frame][at], tv, x)
         });
         for (list, rows) in changes.iter_mut().zip(&rows) {
             let (d, n) = rows.iter().fold((0.0, 0.0), |a, r| (a.0 + r.0, a.1 + r.1));
@@ -407,74 +405,6 @@ fn choose(model: &Model, settings: &Settings, weighted: bool) -> Path {
     Path::Normal
 }
 
-/// What becomes of a row of estimates; returns Σ w (f − Hg − b)².
-fn pixels(
-    settings: &Settings,
-    floor: f32,
-    values: &mut [f32],
-    f: &[f32],
-    b: Option<&[f32]>,
-    w: Option<&[f32]>,
-) -> f64 {
-    const PART: usize = 8;
-    let mut sum = [0f32; PART];
-    let mut total = 0.0;
-    let v = settings.read_variance;
-    let rl = settings.method == Method::Rl;
-    for (i, (values, f)) in values.chunks_exact_mut(PART).zip(f.chunks_exact(PART)).enumerate() {
-        let at = i * PART;
-        for j in 0..PART {
-            let b = b.map_or(0.0, |b| b[at + j]);
-            let w = w.map_or(1.0, |w| w[at + j]);
-            let estimate = values[j];
-            let d = f[j] - estimate - b;
-            sum[j] += w * d * d;
-            values[j] = if rl { w * (f[j] + v) / (estimate + b + v).max(floor) } else { w * estimate };
-        }
-        if i % 64 == 63 {
-            total += sum.iter().map(|s| f64::from(*s)).sum::<f64>();
-            sum = [0.0; PART];
-        }
-    }
-    total + sum.iter().map(|s| f64::from(*s)).sum::<f64>()
-}
-
-/// Updates a row of the volume; returns the squares of the change and of the new values.
-fn voxels(
-    method: Method,
-    values: &[f32],
-    factors: &[f32],
-    variation: Option<&[f32]>,
-    x: &mut [f32],
-) -> (f64, f64) {
-    const PART: usize = 8;
-    let (mut change, mut size) = ([0f32; PART], [0f32; PART]);
-    let (mut total, mut norm) = (0.0, 0.0);
-    let parts = values.chunks_exact(PART).zip(factors.chunks_exact(PART)).zip(x.chunks_exact_mut(PART));
-    for (i, ((values, factors), x)) in parts.enumerate() {
-        for j in 0..PART {
-            let mut new = match method {
-                Method::Rl => x[j] * values[j].max(0.0) * factors[j],
-                Method::Isra => x[j] * factors[j] / values[j].max(FLOOR),
-            };
-            if let Some(tv) = variation {
-                new *= tv[i * PART + j];
-            }
-            let d = new - x[j];
-            change[j] += d * d;
-            size[j] += new * new;
-            x[j] = new;
-        }
-        if i % 64 == 63 {
-            total += change.iter().map(|s| f64::from(*s)).sum::<f64>();
-            norm += size.iter().map(|s| f64::from(*s)).sum::<f64>();
-            (change, size) = ([0.0; PART], [0.0; PART]);
-        }
-    }
-    let rest = |v: [f32; PART]| v.iter().map(|s| f64::from(*s)).sum::<f64>();
-    (total + rest(change), norm + rest(size))
-}
-
 fn check(
     model: &Model,
     frames: &[Frame<'_>],
@@ -512,7 +442,8 @@ fn check(
             }
             for (image, values) in list.iter().enumerate() {
                 model.operator.geometry.check_image(values.len())?;
-                if let Some(i) = values.iter().position(|v| !v.is_finite()) {
+                let strange = kernels::any(values, |v| !v.is_finite());
+                if let Some(i) = values.iter().position(|v| strange && !v.is_finite()) {
                     let (x, y) = (i % width, i / width);
                     return Err(ReconstructError::Pixel { image, x, y, value: values[i] });
                 }
@@ -524,11 +455,14 @@ fn check(
                 let mut found = (0..values.len()).filter(|&i| test(values[i]) && good(i));
                 found.next().map(|first| (first, found.count() + 1))
             };
-            if let Some((i, count)) = bad(&|v| v < 0.0).filter(|_| !settings.clip_negative) {
+            let negative = !settings.clip_negative && kernels::any(values, |v| v < 0.0);
+            let level = settings.saturation.filter(|_| !settings.mask_saturated);
+            let saturated = level.filter(|level| kernels::any(values, |v| v >= *level));
+            if negative && let Some((i, count)) = bad(&|v| v < 0.0) {
                 let (x, y, value) = (i % width, i / width, values[i]);
                 return Err(ReconstructError::Negative { image, count, x, y, value });
             }
-            if let Some(level) = settings.saturation.filter(|_| !settings.mask_saturated)
+            if let Some(level) = saturated
                 && let Some((i, count)) = bad(&|v| v >= level)
             {
                 let (x, y) = (i % width, i / width);
