@@ -321,7 +321,8 @@ fn real(results: &Results, text: &mut String, figures: &mut Figures) -> Result<(
     for z in [7.5, 20.0] {
         let list: Vec<_> = results.real.iter().filter(|r| r.0 == z).collect();
         let series = list.iter().map(|(z, name, w)| (*name, SeriesStyle::Line, axial(w, *z))).collect();
-        let (file, title) = (format!("light-fig15-{z:.0}"), format!("Set-up of §4.3, bead at {z} µm"));
+        let place = if z < 10.0 { "near" } else { "deep" };
+        let (file, title) = (format!("light-fig15-{place}"), format!("Set-up of §4.3, bead at {z} µm"));
         figures.push((file.clone(), chart(&title, "z from the bead, µm", "g, relative", series, None)?));
         shown.push((file, title));
     }
