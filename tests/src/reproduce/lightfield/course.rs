@@ -10,7 +10,8 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-/// What the numbers kept come from: those of other sources are not used again.
+/// What the numbers kept come from: those of other sources are not used again. Images also come from the operator,
+/// which has tests of its own and may change them by its rounding alone.
 const SOURCES: [&str; 6] = [
     include_str!("simulate.rs"),
     include_str!("../../../../host/crates/lightfield/src/psf.rs"),
