@@ -60,7 +60,9 @@ struct Step {
 /// [`Step`] channel by channel.
 #[derive(Debug, Clone)]
 pub(crate) struct Table {
-    /// The channel from which each comes, unless it is its own.
+    /// Channels that stay together, beginning where a multiple of `run` does.
+    pub(crate) run: usize,
+    /// The channel from which the first of each run comes, unless all stay.
     pub(crate) from: Option<Vec<u32>>,
     /// Cosine a and sine b of a turn by a multiple of 90°, for all padded channels: re′ = a re + b im,
     /// im′ = ±(a im − b re).
@@ -71,9 +73,10 @@ pub(crate) struct Table {
 
 impl Table {
     fn new(cell: &Cell, padded: usize, real: bool, step: Step) -> Self {
-        let mut from: Vec<u32> = (0..padded as u32).collect();
+        let run = cell.inner;
+        let mut from: Vec<u32> = Vec::new();
         let mut turn = [(); 2].map(|()| vec![0f32; padded]);
-        for (c, from) in from.iter_mut().enumerate().take(cell.channels()) {
+        for c in 0..cell.channels() {
             let (y, x, i) = cell.split(c);
             let (mut sy, mut sx) = if step.exchange { (x, y) } else { (y, x) };
             let mut f = 1.0;
@@ -89,7 +92,9 @@ impl Table {
                     sx = cell.n[1] - 1 - sx;
                 }
             }
-            *from = cell.at(sy, sx, i) as u32;
+            if i == 0 {
+                from.push(cell.at(sy, sx, 0) as u32);
+            }
             if real && cell.parity(0, y) * cell.parity(1, x) < 0.0 {
                 // times −i
                 turn[1][c] = f;
@@ -97,8 +102,8 @@ impl Table {
                 turn[0][c] = f;
             }
         }
-        let moved = from.iter().enumerate().any(|(c, f)| c as u32 != *f);
-        Self { from: moved.then_some(from), turn, sign: if step.conjugate_x { -1.0 } else { 1.0 } }
+        let moved = from.iter().enumerate().any(|(r, f)| r * run != *f as usize);
+        Self { run, from: moved.then_some(from), turn, sign: if step.conjugate_x { -1.0 } else { 1.0 } }
     }
 }
 

@@ -26,13 +26,21 @@ impl Table {
 
     /// A spectrum's channels in the block's order, in `turned` if they have to be moved.
     #[inline(always)]
-    fn ordered<'a>(&self, from: &'a [f32], turned: &'a mut [f32]) -> &'a [f32] {
+    fn ordered<'a, S: Simd>(&self, s: S, from: &'a [f32], turned: &'a mut [f32]) -> &'a [f32] {
         let Some(list) = &self.from else { return from };
         let c = from.len() / 2;
         let (re, im) = turned.split_at_mut(c);
         let (from_re, from_im) = from.split_at(c);
-        for ((re, im), &at) in re.iter_mut().zip(im).zip(list) {
-            (*re, *im) = (from_re[at as usize], from_im[at as usize]);
+        if self.run == 1 {
+            for ((re, im), &at) in re.iter_mut().zip(im).zip(list) {
+                (*re, *im) = (from_re[at as usize], from_im[at as usize]);
+            }
+            return turned;
+        }
+        for ((re, im), &at) in re.chunks_exact_mut(self.run).zip(im.chunks_exact_mut(self.run)).zip(list) {
+            let at = at as usize..at as usize + self.run;
+            copy(s, &from_re[at.clone()], re);
+            copy(s, &from_im[at], im);
         }
         turned
     }
@@ -54,10 +62,37 @@ impl Table {
         let Some(list) = &self.from else { return };
         let (re, im) = turned.split_at(c);
         let (to_re, to_im) = to.split_at_mut(c);
-        for ((re, im), &at) in re.iter().zip(im).zip(list) {
-            (to_re[at as usize], to_im[at as usize]) = (*re, *im);
+        // the padding is zero
+        let channels = list.len() * self.run;
+        to_re[channels..].fill(0.0);
+        to_im[channels..].fill(0.0);
+        if self.run == 1 {
+            for ((re, im), &at) in re.iter().zip(im).zip(list) {
+                (to_re[at as usize], to_im[at as usize]) = (*re, *im);
+            }
+            return;
+        }
+        for ((re, im), &at) in re.chunks_exact(self.run).zip(im.chunks_exact(self.run)).zip(list) {
+            let at = at as usize..at as usize + self.run;
+            copy(s, re, &mut to_re[at.clone()]);
+            copy(s, im, &mut to_im[at]);
         }
     }
+}
+
+/// Copies a few numbers, which a call would take longer for.
+#[inline(always)]
+fn copy<S: Simd>(s: S, from: &[f32], to: &mut [f32]) {
+    let n = from.len();
+    if n < LANES {
+        to.iter_mut().zip(from).for_each(|(t, f)| *t = *f);
+        return;
+    }
+    for (from, to) in from.as_chunks::<LANES>().0.iter().zip(to.as_chunks_mut::<LANES>().0) {
+        V::from_slice(s, from).store_slice(to);
+    }
+    // overlaps what was copied before
+    part(s, from, n - LANES).store_slice(&mut to[n - LANES..n]);
 }
 
 /// Vectors of a block, in and out.
@@ -113,7 +148,7 @@ impl<T: Element> Work for Multiply<'_, '_, T> {
                     let (f, m) = job(j);
                     let at = (members[m].kx * engine.grid[0] + members[m].ky) * 2 * c;
                     tables[j] = &from.tables[members[m].step];
-                    spectra[j] = tables[j].ordered(&planes[f][at..at + 2 * c], turned);
+                    spectra[j] = tables[j].ordered(s, &planes[f][at..at + 2 * c], turned);
                 }
                 let signs = tables.map(|t| V::splat(s, t.sign));
                 let (upper, lower) = x.split_at_mut(VECTORS * c);

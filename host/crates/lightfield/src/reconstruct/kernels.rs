@@ -135,26 +135,43 @@ impl Kernel for Voxels<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, _: S) -> (f64, f64) {
-        let Self { rl, values, factors, variation, x } = self;
+        match (self.rl, self.variation.is_some()) {
+            (true, false) => self.all::<true, false>(),
+            (true, true) => self.all::<true, true>(),
+            (false, false) => self.all::<false, false>(),
+            (false, true) => self.all::<false, true>(),
+        }
+    }
+}
+
+impl Voxels<'_> {
+    /// `TV`: with total variation.
+    #[inline(always)]
+    fn all<const RL: bool, const TV: bool>(self) -> (f64, f64) {
+        let Self { values, factors, variation, x, .. } = self;
         let (mut change, mut size) = ([0f32; LANES], [0f32; LANES]);
         let (mut total, mut norm) = (0.0, 0.0);
         let parts = values.as_chunks::<LANES>().0.iter().zip(factors.as_chunks::<LANES>().0);
         for (i, ((values, factors), x)) in parts.zip(x.as_chunks_mut::<LANES>().0).enumerate() {
-            let variation = variation.and_then(|v| v[i * LANES..].first_chunk::<LANES>());
+            let mut new = [0f32; LANES];
             for j in 0..LANES {
-                let mut new = if rl {
+                new[j] = if RL {
                     x[j] * values[j].max(0.0) * factors[j]
                 } else {
                     x[j] * factors[j] / values[j].max(FLOOR)
                 };
-                if let Some(variation) = variation {
-                    new *= variation[j];
-                }
-                let d = new - x[j];
-                change[j] += d * d;
-                size[j] += new * new;
-                x[j] = new;
             }
+            if TV && let Some(variation) = variation.and_then(|v| v[i * LANES..].first_chunk::<LANES>()) {
+                for j in 0..LANES {
+                    new[j] *= variation[j];
+                }
+            }
+            for j in 0..LANES {
+                let d = new[j] - x[j];
+                change[j] += d * d;
+                size[j] += new[j] * new[j];
+            }
+            *x = new;
             if i % 64 == 63 {
                 total += change.iter().map(|s| f64::from(*s)).sum::<f64>();
                 norm += size.iter().map(|s| f64::from(*s)).sum::<f64>();
