@@ -8,7 +8,18 @@ use std::process::ExitCode;
 fn run(chapter: &str, extent: Extent, docs: &std::path::Path) -> Result<(), ReproduceError> {
     let part = match chapter {
         "macro" => macroscopic::part(&macroscopic::run(extent, &|what| println!("{what}"))?)?,
-        "lightfield" => lightfield::part(&lightfield::run(extent, &|what| println!("{what}"))?)?,
+        "lightfield" => {
+            // what was computed is kept beside the builds: an interrupted run goes on
+            let target = std::env::var_os("CARGO_TARGET_DIR")
+                .map_or_else(|| daic_tests::shared::root().join("target"), PathBuf::from);
+            let folder = target.join("reproduce-lightfield");
+            if extent == Extent::Full {
+                std::fs::create_dir_all(&folder)
+                    .map_err(|source| ReproduceError::File { path: folder.clone(), source })?;
+            }
+            let kept = (extent == Extent::Full).then_some(folder.as_path());
+            lightfield::part(&lightfield::run(extent, kept, &|what| println!("{what}"))?)?
+        }
         _ => microscopic::part(&microscopic::run(extent)?)?,
     };
     println!("{}", part.text);

@@ -28,8 +28,8 @@ cargo xtask COMMAND
   datasheet  measures on the emulated Pico and writes the numbers into docs/datasheet.md
   figures    draws the pictures of README and docs anew with the program itself
   coverage   2 000 simulated calibrations: what the stated uncertainties cover (minutes)
-  reproduce  macro: chapter 2 of the thesis, micro: chapter 3, lightfield: chapter 4 (about an
-             hour), simulated and measured, into docs/reproduction.md
+  reproduce  macro: chapter 2 of the thesis, micro: chapter 3, lightfield: chapter 4 (a quarter of an
+             hour; an interrupted run goes on), simulated and measured, into docs/reproduction.md
   fuzz       [--long]: each fuzz target for a minute (an hour); needs a nightly compiler and cargo-fuzz
   bench      correlate [--quick]: speed, memory and errors beside pyvale, into docs/performance.md
              optics: speed of the decoders

@@ -1,13 +1,20 @@
 //! Chapter 4: volumes from one shot, with and without the grating (figures 15–21).
 
+mod course;
+mod figures;
 mod page;
 mod simulate;
+mod summary;
 
+pub use course::Course;
 pub use page::part;
-pub use simulate::{BEAD_UM, Camera, Optics, View, Widths, fwhm};
+pub use simulate::{BEAD_UM, Beads, Camera, Data, Optics, View, Widths, fwhm};
 
 use super::{Extent, ReproduceError};
 use daic_lightfield::DiffractionModel;
+use figures::{angle, boxed, conditions, convergence, real_setup, seven_true};
+use simulate::light_within;
+use std::path::Path;
 
 /// Iterations of Richardson–Lucy, as in the thesis.
 pub const ITERATIONS: usize = 8;
@@ -42,6 +49,8 @@ pub struct Models {
 pub struct Angle {
     /// Diffraction angle, degrees; 0 without a grating.
     pub degrees: f64,
+    /// Radius of the reconstruction's point spread function, lenslets.
+    pub radius: usize,
     /// Models.
     pub models: Models,
     /// What was measured.
@@ -51,7 +60,7 @@ pub struct Angle {
 /// A reconstructed box.
 #[derive(Debug)]
 pub struct Boxed {
-    /// `plain`, `virtual`, `pupil`, or `pupil as virtual`.
+    /// `true`, `plain`, `virtual`, `pupil`, or `pupil as virtual`.
     pub name: &'static str,
     /// Each bead.
     pub widths: Vec<Widths>,
@@ -89,35 +98,72 @@ pub struct Results {
     pub angles: Vec<Angle>,
     /// Figure 16.
     pub seven: Vec<Boxed>,
+    /// Figure 16: both views of the seven beads, exact phase, square.
+    pub views: Vec<Vec<f32>>,
     /// Figures 18, 19, 21.
     pub conditions: Vec<Condition>,
-    /// Figure 20: iterations, distance to the truth, distance to the last iterate.
-    pub convergence: Vec<[f64; 3]>,
+    /// Figure 20.
+    pub convergence: Vec<Convergence>,
     /// Figure 15: bead depth, name, widths.
     pub real: Vec<(f64, &'static str, Widths)>,
     /// Each point spread function: what, least share of light held, sampling error.
     pub psfs: Vec<(String, f64, f64)>,
+    /// Light of a point by radius.
+    pub light: Vec<Light>,
 }
 
-/// Images of one kind of data: the bead at 20 µm, and what else is asked for.
-struct Data {
-    images: Vec<Vec<Vec<f32>>>,
+/// A volume after so many iterations; all numbers are relative.
+#[derive(Debug, Clone, Copy)]
+pub struct Convergence {
+    /// Iterations.
+    pub iterations: usize,
+    /// Distance to the truth.
+    pub truth: f64,
+    /// Distance to the last iterate looked at.
+    pub last: f64,
+    /// Change by the last iteration.
+    pub change: f64,
+    /// Distance of the images of the volume before the last iteration to those given.
+    pub residual: f64,
+    /// Distance to the truth, and the residual, of images made by the reconstruction's own projector.
+    pub crime: [f64; 2],
 }
 
-impl Data {
-    fn new(
-        optics: &Optics,
-        extent: Extent,
-        scenes: &[Vec<[f64; 3]>],
-        results: &mut Results,
-    ) -> Result<Self, ReproduceError> {
-        let depths: Vec<f64> = scenes.iter().flatten().map(|b| b[2]).collect();
-        let view = View::fine(optics, extent, &depths)?;
-        results.psfs.push((described(optics, "images"), view.energy, view.sampling_error));
-        let images = scenes.iter().map(|s| view.images(s)).collect::<Result<_, _>>()?;
-        Ok(Self { images })
-    }
+/// Light of a point on the axis.
+#[derive(Debug, Clone, Copy)]
+pub struct Light {
+    /// Diffraction angle.
+    pub degrees: f64,
+    /// Depth, µm.
+    pub z_um: f64,
+    /// Model.
+    pub model: DiffractionModel,
+    /// Share within each of [`RADII`].
+    pub held: [f64; RADII.len()],
 }
+
+/// Radii in lenslets of the point spread functions under an angle: light that the radius of the reconstruction
+/// does not hold is in the images all the same, where time allows.
+struct Case {
+    degrees: f64,
+    reconstruction: usize,
+    images_virtual: usize,
+    images_pupil: usize,
+}
+
+const fn case(degrees: f64, reconstruction: usize, images_virtual: usize, images_pupil: usize) -> Case {
+    Case { degrees, reconstruction, images_virtual, images_pupil }
+}
+
+const FULL: [Case; 4] =
+    [case(0.0, 4, 5, 5), case(30.0, 8, 9, 11), case(15.0, 5, 6, 6), case(45.0, 11, 12, 15)];
+const QUICK: [Case; 2] = [case(0.0, 3, 3, 3), case(30.0, 5, 5, 5)];
+/// Of a second reconstruction at 30°, which shows what the radius changes.
+const WIDER: usize = 11;
+/// Radii of the table of light.
+pub const RADII: [usize; 7] = [2, 4, 6, 8, 11, 15, 20];
+/// Point spread functions and tables in a full run.
+const STAGES: usize = 22;
 
 fn described(optics: &Optics, what: &str) -> String {
     let grating = optics.grating.map_or("no grating".to_owned(), |(pitch, model)| {
@@ -126,33 +172,31 @@ fn described(optics: &Optics, what: &str) -> String {
     format!("{what}, lenslets {} µm, {grating}, radius {}", optics.lenslets[0], optics.radius)
 }
 
-fn coarse(optics: &Optics, extent: Extent, results: &mut Results) -> Result<View, ReproduceError> {
-    let view = View::coarse(optics, extent)?;
-    results.psfs.push((described(optics, "reconstruction"), view.energy, view.sampling_error));
-    Ok(view)
+/// What all parts of a run share.
+struct Run<'a> {
+    extent: Extent,
+    course: Course<'a>,
+    results: Results,
 }
 
-/// Runs chapter 4.
-///
-/// # Errors
-/// What point spread functions, operators or reconstructions refuse.
-pub fn run(extent: Extent, said: &dyn Fn(&str)) -> Result<Results, ReproduceError> {
-    let nothing = Widths { fwhm_um: [f64::NAN; 3], peak_um: f64::NAN, axial: Vec::new() };
-    let mut results = Results {
-        truth: nothing,
-        angles: Vec::new(),
-        seven: Vec::new(),
-        conditions: Vec::new(),
-        convergence: Vec::new(),
-        real: Vec::new(),
-        psfs: Vec::new(),
-    };
-    let full = extent == Extent::Full;
-    // radii are a compromise with time; the shares of light they hold are on the page
-    let list: &[(f64, usize)] =
-        if full { &[(0.0, 4), (30.0, 8), (15.0, 5), (45.0, 11)] } else { &[(0.0, 3), (30.0, 5)] };
-    for &(degrees, radius) in list {
-        said(&format!("{degrees}°"));
+impl Run<'_> {
+    fn images(&mut self, optics: Optics, radius: usize, scenes: &[Beads]) -> Result<Data, ReproduceError> {
+        let optics = Optics { radius, ..optics };
+        let what = described(&optics, "images");
+        let data = Data::new(&optics, self.extent, scenes, &what, &self.course)?;
+        self.results.psfs.push((what, data.energy, data.sampling_error));
+        Ok(data)
+    }
+
+    fn view(&mut self, optics: Optics) -> Result<View, ReproduceError> {
+        let what = described(&optics, "reconstruction");
+        let view = View::coarse(&optics, self.extent, &what, &self.course)?;
+        self.results.psfs.push((what, view.energy, view.sampling_error));
+        Ok(view)
+    }
+
+    fn case(&mut self, case: &Case) -> Result<(), ReproduceError> {
+        let (degrees, radius, full) = (case.degrees, case.reconstruction, self.extent == Extent::Full);
         let seven = full && (degrees == 0.0 || degrees == 30.0);
         let mut scenes = vec![vec![BEAD]];
         if seven {
@@ -163,143 +207,106 @@ pub fn run(extent: Extent, said: &dyn Fn(&str)) -> Result<Results, ReproduceErro
         }
         if degrees == 0.0 {
             let optics = Optics { radius, ..Optics::PLAIN };
-            let data = Data::new(&optics, extent, &scenes, &mut results)?;
-            let view = coarse(&optics, extent, &mut results)?;
-            results.truth = view.widths(&view.spheres(&vec![BEAD]), BEAD);
+            let data = self.images(optics, case.images_virtual, &scenes)?;
+            let view = self.view(optics)?;
+            self.results.truth = view.widths(&view.spheres(&vec![BEAD]), BEAD);
             let models = Models { data: None, reconstruction: None };
-            angle(&view, &data, degrees, models, &mut results)?;
+            angle(&view, &data, degrees, radius, models, &mut self.results)?;
             if seven {
-                boxed("plain", &view, &data, &mut results)?;
+                self.results.seven.push(seven_true(&view));
+                boxed("plain", &view, &data, &mut self.results)?;
             }
-            continue;
+            return Ok(());
         }
         let pitch = WAVELENGTH_UM / degrees.to_radians().sin();
         let [of_virtual, of_pupil] = [VIRTUAL, PUPIL].map(|m| Optics::PLAIN.with(pitch, radius, m));
-        let plain = Data::new(&of_virtual, extent, &scenes, &mut results)?;
-        let exact = full.then(|| Data::new(&of_pupil, extent, &scenes, &mut results)).transpose()?;
-        let view = coarse(&of_virtual, extent, &mut results)?;
         let of = |data, reconstruction| Models { data: Some(data), reconstruction: Some(reconstruction) };
-        angle(&view, &plain, degrees, of(VIRTUAL, VIRTUAL), &mut results)?;
-        if let Some(exact) = &exact {
-            angle(&view, exact, degrees, of(PUPIL, VIRTUAL), &mut results)?;
-            let other = coarse(&of_pupil, extent, &mut results)?;
-            angle(&other, exact, degrees, of(PUPIL, PUPIL), &mut results)?;
-            if seven {
-                boxed("virtual", &view, &plain, &mut results)?;
-                boxed("pupil", &other, exact, &mut results)?;
-                boxed("pupil as virtual", &view, exact, &mut results)?;
-                conditions([(&view, &plain), (&other, exact)], &mut results)?;
-            }
-        }
+        let plain = self.images(of_virtual, case.images_virtual, &scenes)?;
+        let view = self.view(of_virtual)?;
+        angle(&view, &plain, degrees, radius, of(VIRTUAL, VIRTUAL), &mut self.results)?;
         if degrees == 30.0 {
-            convergence(&view, &plain, extent, &mut results)?;
+            convergence(&view, &plain, self.extent, &mut self.results)?;
         }
-    }
-    results.angles.sort_by(|a, b| a.degrees.total_cmp(&b.degrees));
-    if full {
-        said("the set-up of §4.3");
-        real_setup(extent, &mut results)?;
-    }
-    Ok(results)
-}
-
-fn angle(
-    view: &View,
-    data: &Data,
-    degrees: f64,
-    models: Models,
-    results: &mut Results,
-) -> Result<(), ReproduceError> {
-    let volume = view.reconstruct(&Camera::GOOD.take(&data.images[0], 1), ITERATIONS)?;
-    let widths = view.widths(&volume, BEAD);
-    results.angles.push(Angle { degrees, models, widths });
-    Ok(())
-}
-
-fn boxed(name: &'static str, view: &View, data: &Data, results: &mut Results) -> Result<(), ReproduceError> {
-    let volume = view.reconstruct(&Camera::GOOD.take(&data.images[1], 2), ITERATIONS)?;
-    results.seven.push(Boxed {
-        name,
-        widths: SEVEN.iter().map(|c| view.widths(&volume, *c)).collect(),
-        shape: view.shape(),
-        voxel_um: view.voxel_um(),
-        first_um: view.first_um(),
-        volume,
-    });
-    Ok(())
-}
-
-/// Figures 18, 19 and 21, each with the virtual point and with the exact phase.
-fn conditions(both: [(&View, &Data); 2], results: &mut Results) -> Result<(), ReproduceError> {
-    let noisy = |snr| Camera { snr: Some(snr), ..Camera::GOOD };
-    let list = [
-        (18, "z = 7.5 µm", 2, 7.5, Camera::GOOD),
-        (18, "z = 20 µm", 0, 20.0, Camera::GOOD),
-        (18, "z = 30 µm", 3, 30.0, Camera::GOOD),
-        (19, "8 bits", 0, 20.0, Camera { bits: 8, snr: None }),
-        (19, "16 bits", 0, 20.0, Camera::GOOD),
-        (21, "SNR 1000", 0, 20.0, noisy(1000.0)),
-        (21, "SNR 100", 0, 20.0, noisy(100.0)),
-        (21, "SNR 20", 0, 20.0, noisy(20.0)),
-    ];
-    for (figure, name, scene, z_um, camera) in list {
-        let measure = |(view, data): (&View, &Data)| -> Result<Widths, ReproduceError> {
-            let volume = view.reconstruct(&camera.take(&data.images[scene], 3), ITERATIONS)?;
-            Ok(view.widths(&volume, [0.0, 0.0, z_um]))
-        };
-        let (virtual_point, pupil) = (measure(both[0])?, measure(both[1])?);
-        results.conditions.push(Condition { figure, name, z_um, virtual_point, pupil });
-    }
-    Ok(())
-}
-
-/// Figure 20.
-fn convergence(
-    view: &View,
-    data: &Data,
-    extent: Extent,
-    results: &mut Results,
-) -> Result<(), ReproduceError> {
-    // at the scale of the truth
-    let images = &data.images[0];
-    let truth = view.spheres(&vec![BEAD]);
-    let steps: &[usize] =
-        if extent == Extent::Full { &[1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64] } else { &[1, 8, 16] };
-    let iterates: Vec<Vec<f32>> =
-        steps.iter().map(|&n| view.reconstruct(images, n)).collect::<Result<_, _>>()?;
-    let distance = |a: &[f32], b: &[f32]| {
-        let (d, n) = a.iter().zip(b).fold((0.0, 0.0), |(d, n), (a, b)| {
-            (d + (f64::from(*a) - f64::from(*b)).powi(2), n + f64::from(*b).powi(2))
-        });
-        (d / n).sqrt()
-    };
-    let last = iterates.last().map_or(&truth, |l| l);
-    for (n, g) in steps.iter().zip(&iterates) {
-        results.convergence.push([*n as f64, distance(g, &truth), distance(g, last)]);
-    }
-    Ok(())
-}
-
-/// Figure 15: grating of 2 µm (13°), lenslets of 125 µm, an 8-bit camera.
-fn real_setup(extent: Extent, results: &mut Results) -> Result<(), ReproduceError> {
-    let with = |m| Optics::REAL.with(2.0, 6, m);
-    let depths = [7.5, 20.0];
-    let scenes = depths.map(|z| vec![[0.0, 0.0, z]]);
-    let of_pupil = Data::new(&with(PUPIL), extent, &scenes, results)?;
-    let of_virtual = Data::new(&with(VIRTUAL), extent, &scenes, results)?;
-    let plain = Data::new(&Optics::REAL, extent, &scenes, results)?;
-    let mut measure = |view: &View, data: &Data, name: &'static str| -> Result<(), ReproduceError> {
-        for (z, images) in depths.into_iter().zip(&data.images) {
-            let camera = Camera { bits: 8, snr: Some(50.0) };
-            let volume = view.reconstruct(&camera.take(images, 4), ITERATIONS)?;
-            results.real.push((z, name, view.widths(&volume, [0.0, 0.0, z])));
+        if !full {
+            return Ok(());
+        }
+        let exact = self.images(of_pupil, case.images_pupil, &scenes)?;
+        angle(&view, &exact, degrees, radius, of(PUPIL, VIRTUAL), &mut self.results)?;
+        let other = self.view(of_pupil)?;
+        angle(&other, &exact, degrees, radius, of(PUPIL, PUPIL), &mut self.results)?;
+        if seven {
+            self.results.views = exact.images[1].clone();
+            boxed("virtual", &view, &plain, &mut self.results)?;
+            boxed("pupil", &other, &exact, &mut self.results)?;
+            boxed("pupil as virtual", &view, &exact, &mut self.results)?;
+            conditions([(&view, &plain), (&other, &exact)], &mut self.results)?;
+            let wider = self.view(Optics { radius: WIDER, ..of_pupil })?;
+            angle(&wider, &exact, degrees, WIDER, of(PUPIL, PUPIL), &mut self.results)?;
         }
         Ok(())
+    }
+
+    /// Light of a point on the axis by radius.
+    fn light(&mut self) -> Result<(), ReproduceError> {
+        let objective = daic_lightfield::PsfParameters::thesis(Vec::new()).objective;
+        let most = RADII[RADII.len() - 1];
+        let mut cases = Vec::new();
+        for degrees in [15.0, 30.0, 45.0] {
+            for z_um in [7.5, 20.0, 30.0, 40.0] {
+                cases.extend([VIRTUAL, PUPIL].map(|model| (degrees, z_um, model)));
+            }
+        }
+        let (_, shares) =
+            self.course.stage("light by radius", &format!("{objective:?} {cases:?} {most}"), || {
+                let mut shares = Vec::new();
+                for &(degrees, z_um, model) in &cases {
+                    let held = light_within(&objective, degrees, model, z_um, most)?;
+                    shares.extend(held.iter().map(|h| *h as f32));
+                }
+                Ok((String::new(), shares))
+            })?;
+        for ((degrees, z_um, model), held) in cases.into_iter().zip(shares.chunks_exact(most + 1)) {
+            let held = RADII.map(|r| f64::from(held[r]));
+            self.results.light.push(Light { degrees, z_um, model, held });
+        }
+        Ok(())
+    }
+}
+
+/// Runs chapter 4. Point spread functions and images are kept in `folder`, if there is one, so that a run that was
+/// interrupted goes on.
+///
+/// # Errors
+/// What point spread functions, operators or reconstructions refuse; files that cannot be written.
+pub fn run(
+    extent: Extent,
+    folder: Option<&Path>,
+    said: &(dyn Fn(&str) + Sync),
+) -> Result<Results, ReproduceError> {
+    let nothing =
+        Widths { fwhm_um: [f64::NAN; 3], peak_um: f64::NAN, lateral: Vec::new(), axial: Vec::new() };
+    let results = Results {
+        truth: nothing,
+        angles: Vec::new(),
+        seven: Vec::new(),
+        views: Vec::new(),
+        conditions: Vec::new(),
+        convergence: Vec::new(),
+        real: Vec::new(),
+        psfs: Vec::new(),
+        light: Vec::new(),
     };
-    measure(&View::coarse(&Optics::REAL, extent)?, &plain, "no grating")?;
-    let view = View::coarse(&with(VIRTUAL), extent)?;
-    measure(&view, &of_virtual, "virtual")?;
-    // light behaves as the exact phase says; the thesis reconstructs with the virtual point
-    measure(&view, &of_pupil, "pupil as virtual")?;
-    measure(&View::coarse(&with(PUPIL), extent)?, &of_pupil, "pupil")
+    let full = extent == Extent::Full;
+    let cases: &[Case] = if full { &FULL } else { &QUICK };
+    let stages = if full { STAGES } else { 2 * QUICK.len() };
+    let mut run = Run { extent, course: Course::new(folder, stages, said), results };
+    for case in cases {
+        run.case(case)?;
+    }
+    run.results.angles.sort_by(|a, b| a.degrees.total_cmp(&b.degrees));
+    if full {
+        real_setup(&mut run)?;
+        run.light()?;
+    }
+    Ok(run.results)
 }

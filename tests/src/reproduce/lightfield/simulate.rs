@@ -1,9 +1,11 @@
 //! The microscope of chapter 4: images with finer sampling than reconstructions use.
 
+use super::course::{Course, garbled, json};
 use crate::reproduce::{Extent, ReproduceError};
+use daic_lightfield::debye::{DebyeTable, pupil_field};
 use daic_lightfield::{
-    DiffractionModel, Frame, Grating, Lenslets, Method, Model, Operator, OperatorSettings, Order,
-    Oversampling, Psf, PsfParameters, Radius, Settings, native_widths, reconstruct,
+    DiffractionModel, Frame, Grating, Lenslets, Method, Model, Objective, Operator, OperatorSettings, Order,
+    Oversampling, Psf, PsfParameters, Radius, Reconstruction, Settings, State, native_widths, reconstruct,
 };
 
 /// Diameter of a bead, µm.
@@ -36,8 +38,8 @@ impl Optics {
 
     fn parameters(&self, extent: Extent, planes_um: Vec<f64>, fine: bool) -> PsfParameters {
         let samples = match (extent, fine) {
-            (Extent::Full, true) => 6,
-            (Extent::Full, false) => 5,
+            (Extent::Full, true) => 5,
+            (Extent::Full, false) => 4,
             (Extent::Quick, true) => 4,
             (Extent::Quick, false) => 3,
         };
@@ -57,6 +59,92 @@ impl Optics {
 /// Centres (x, y, z) of beads, µm from the middle of the field.
 pub type Beads = Vec<[f64; 3]>;
 
+/// Images of several scenes.
+pub struct Data {
+    /// Of each scene, those of all orders.
+    pub images: Vec<Vec<Vec<f32>>>,
+    /// Least share of a plane's light that the point spread function holds.
+    pub energy: f64,
+    /// Change of the point spread function when sampled 1.8 times as finely.
+    pub sampling_error: f64,
+}
+
+impl Data {
+    /// Images with five voxels a lenslet, planes 2 µm apart near the beads, and finer fields.
+    ///
+    /// # Errors
+    /// What point spread function or operator refuse.
+    pub fn new(
+        optics: &Optics,
+        extent: Extent,
+        scenes: &[Beads],
+        what: &str,
+        course: &Course<'_>,
+    ) -> Result<Self, ReproduceError> {
+        let near =
+            |z: f64| scenes.iter().flatten().any(|b| (b[2] - z).abs() <= 0.5 * (BEAD_UM + FINE_STEP_UM));
+        let planes = (0..=21).map(|z| f64::from(z) * FINE_STEP_UM).filter(|z| near(*z)).collect();
+        let parameters = optics.parameters(extent, planes, true);
+        let key = format!("{} {extent:?} {scenes:?}", json(&parameters)?);
+        let (text, numbers) = course.stage(what, &key, || {
+            let psf = course.compute(&parameters)?;
+            let view = View::new(optics, extent, &psf, FINE_STEP_UM)?;
+            let mut numbers = Vec::new();
+            for scene in scenes {
+                numbers.extend(view.images(scene)?.concat());
+            }
+            let text = serde_json::to_string(&(view.energy, view.sampling_error)).map_err(garbled)?;
+            Ok((text, numbers))
+        })?;
+        let (energy, sampling_error) = serde_json::from_str(&text).map_err(garbled)?;
+        let orders = if optics.grating.is_some() { 2 } else { 1 };
+        let all: Vec<Vec<f32>> = numbers
+            .chunks_exact((numbers.len() / scenes.len() / orders).max(1))
+            .map(<[f32]>::to_vec)
+            .collect();
+        Ok(Self { images: all.chunks_exact(orders).map(<[_]>::to_vec).collect(), energy, sampling_error })
+    }
+}
+
+/// Share of the light of a point at depth `z_um` in the lenslets up to 0, 1 … `most` around its own, before the
+/// lenslets.
+///
+/// # Errors
+/// Integrals that do not settle.
+pub fn light_within(
+    objective: &Objective,
+    degrees: f64,
+    model: DiffractionModel,
+    z_um: f64,
+    most: usize,
+) -> Result<Vec<f64>, ReproduceError> {
+    // the field's highest frequency, NA/λ, asks for 17 a lenslet of 7.5 µm in the object
+    const SAMPLES: usize = 18;
+    const CELL_UM: f64 = 7.5;
+    let (sine, cosine) = degrees.to_radians().sin_cos();
+    let count = (2 * most + 1) * SAMPLES;
+    let step = CELL_UM / SAMPLES as f64;
+    let xs: Vec<f64> = (0..count).map(|i| (i as f64 + 0.5 - 0.5 * count as f64) * step).collect();
+    let field = match model {
+        DiffractionModel::Pupil => pupil_field(objective, -sine * objective.index, z_um, &xs, &xs)?.0,
+        DiffractionModel::Virtual => {
+            let shift = z_um * sine / cosine;
+            let far = (0.5 * count as f64 * step).hypot(0.5 * count as f64 * step + shift);
+            let table = DebyeTable::new(objective, far, &[z_um / cosine.powi(3)])?;
+            let at = |x: f64, y: f64| table.planes.first().map(|f| f.at((x + shift).hypot(y)));
+            xs.iter().flat_map(|y| xs.iter().filter_map(|x| at(*x, *y)).collect::<Vec<_>>()).collect()
+        }
+    };
+    let mut held = vec![0.0; most + 1];
+    let area = (step * objective.magnification).powi(2);
+    for (i, v) in field.iter().enumerate() {
+        let (y, x) = (i / count / SAMPLES, i % count / SAMPLES);
+        let far = y.abs_diff(most).max(x.abs_diff(most));
+        held[far..].iter_mut().for_each(|h| *h += v.norm_sqr() * area);
+    }
+    Ok(held)
+}
+
 /// A projector with its geometry.
 pub struct View {
     model: Model,
@@ -75,6 +163,8 @@ pub struct Widths {
     pub fwhm_um: [f64; 3],
     /// Where the profile along z is highest.
     pub peak_um: f64,
+    /// Profile along x.
+    pub lateral: Vec<(f64, f64)>,
     /// Profile along z.
     pub axial: Vec<(f64, f64)>,
 }
@@ -84,27 +174,23 @@ impl View {
     ///
     /// # Errors
     /// What point spread function or operator refuse.
-    pub fn coarse(optics: &Optics, extent: Extent) -> Result<Self, ReproduceError> {
+    pub fn coarse(
+        optics: &Optics,
+        extent: Extent,
+        what: &str,
+        course: &Course<'_>,
+    ) -> Result<Self, ReproduceError> {
         let planes = match extent {
             Extent::Full => 0..17,
             Extent::Quick => 4..13,
         };
-        Self::new(optics, extent, planes.map(|z| f64::from(z) * STEP_UM).collect(), false)
+        let planes = planes.map(|z| f64::from(z) * STEP_UM).collect();
+        let psf = course.psf(what, &optics.parameters(extent, planes, false))?;
+        Self::new(optics, extent, &psf, STEP_UM)
     }
 
-    /// For the images of beads at these depths: five voxels a lenslet, planes 2 µm apart, finer fields.
-    ///
-    /// # Errors
-    /// As [`View::coarse`].
-    pub fn fine(optics: &Optics, extent: Extent, depths: &[f64]) -> Result<Self, ReproduceError> {
-        let near = |z: f64| depths.iter().any(|d| (d - z).abs() <= 0.5 * (BEAD_UM + FINE_STEP_UM));
-        let all = (0..=21).map(|z| f64::from(z) * FINE_STEP_UM);
-        Self::new(optics, extent, all.filter(|z| near(*z)).collect(), true)
-    }
-
-    fn new(optics: &Optics, extent: Extent, planes_um: Vec<f64>, fine: bool) -> Result<Self, ReproduceError> {
-        let parameters = optics.parameters(extent, planes_um, fine);
-        let psf = Psf::compute(&parameters)?;
+    fn new(optics: &Optics, extent: Extent, psf: &Psf, step_um: f64) -> Result<Self, ReproduceError> {
+        let parameters = &psf.parameters;
         let [voxel_um, _] = parameters.voxel_um();
         let cells = match extent {
             // 35 · 7.5 µm cover the box of 256 µm
@@ -112,16 +198,15 @@ impl View {
             Extent::Quick => 11,
         };
         let model = Model {
-            operator: Operator::new(&psf, &OperatorSettings::new([cells; 2]))?,
+            operator: Operator::new(psf, &OperatorSettings::new([cells; 2]))?,
             orders: if optics.grating.is_some() { 2 } else { 1 },
             normal: None,
-            voxel_um: [if fine { FINE_STEP_UM } else { STEP_UM }, voxel_um, voxel_um],
-            widths: native_widths(&parameters),
+            voxel_um: [step_um, voxel_um, voxel_um],
+            widths: native_widths(parameters),
         };
         let energy = psf.report.energy.iter().copied().fold(1.0, f64::min);
         let sampling_error = psf.report.sampling_error;
-        println!("{optics:?} fine {fine}: energy {energy:.4}, sampling error {sampling_error:.1e}");
-        Ok(Self { model, planes: parameters.planes_um, voxel_um, energy, sampling_error })
+        Ok(Self { model, planes: parameters.planes_um.clone(), voxel_um, energy, sampling_error })
     }
 
     /// Size of voxels (z, lateral), µm.
@@ -183,15 +268,30 @@ impl View {
         Ok(images)
     }
 
-    /// Richardson–Lucy.
+    /// Richardson–Lucy from a uniform volume.
     ///
     /// # Errors
     /// Images that cannot be reconstructed.
     pub fn reconstruct(&self, images: &[Vec<f32>], iterations: usize) -> Result<Vec<f32>, ReproduceError> {
+        Ok(self.go_on(images, None, iterations)?.state.volume)
+    }
+
+    /// Richardson–Lucy up to so many iterations, from a state or from a uniform volume.
+    ///
+    /// # Errors
+    /// Images that cannot be reconstructed.
+    pub fn go_on(
+        &self,
+        images: &[Vec<f32>],
+        from: Option<State>,
+        iterations: usize,
+    ) -> Result<Reconstruction, ReproduceError> {
         let frame = Frame { images: images.iter().map(Vec::as_slice).collect(), ..Frame::default() };
         let settings = Settings { clip_negative: true, ..Settings::new(Method::Rl, iterations) };
-        let (mut out, _) = reconstruct(&self.model, &[frame], &settings, None, &mut |_| true)?;
-        Ok(out.remove(0).state.volume)
+        let from = from.map(|s| [s]);
+        let start = from.as_ref().map(<[State; 1]>::as_slice);
+        let (mut out, _) = reconstruct(&self.model, &[frame], &settings, start, &mut |_| true)?;
+        Ok(out.remove(0))
     }
 
     /// Widths of a bead: profiles through the voxel nearest to its true centre.
@@ -210,7 +310,9 @@ impl View {
         ];
         let axial: Vec<(f64, f64)> = (0..nz).map(|i| (self.planes[i], value(i, y, x))).collect();
         let peak_um = axial.iter().copied().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(f64::NAN, |p| p.0);
-        Widths { fwhm_um: [fwhm(&lateral[0]), fwhm(&lateral[1]), fwhm(&axial)], peak_um, axial }
+        let fwhm_um = [fwhm(&lateral[0]), fwhm(&lateral[1]), fwhm(&axial)];
+        let [lateral, _] = lateral;
+        Widths { fwhm_um, peak_um, lateral, axial }
     }
 }
 
