@@ -8,7 +8,7 @@ use std::path::Path;
 
 fn axes(map: &FloatMap) -> GridAxes {
     let a = &map.axes;
-    GridAxes { x0: a.x0, dx: a.dx, y0: a.y0, dy: a.dy, unit: a.unit.clone() }
+    GridAxes { x0: a.x0, dx: a.dx, y0: a.y0, dy: a.dy, unit: a.unit.clone(), names: ["x", "y"] }
 }
 
 fn heatmap(map: &FloatMap, title: &str, quantity: &str, unit: &str, factor: f64) -> Heatmap {

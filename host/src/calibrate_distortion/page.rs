@@ -28,7 +28,7 @@ fn heatmap(like: &FloatMap, d: &Drawn) -> Heatmap {
         height: like.height as usize,
         scale: if d.signed { ColourScale::errors(&d.values) } else { ColourScale::values(&d.values) },
         values: d.values.clone(),
-        axes: GridAxes { x0: a.x0, dx: a.dx, y0: a.y0, dy: a.dy, unit: a.unit.clone() },
+        axes: GridAxes { x0: a.x0, dx: a.dx, y0: a.y0, dy: a.dy, unit: a.unit.clone(), names: ["x", "y"] },
         quantity: d.quantity.to_owned(),
         unit: "px".to_owned(),
     }

@@ -119,6 +119,11 @@ pub fn write_report(
             "xz" => ("y", (0.0, dx), (volume.first_um, dz)),
             _ => ("x", (volume.first_um, dz), (0.0, dy)),
         };
+        let names = match suffix {
+            "xy" => ["x", "y"],
+            "xz" => ["x", "z"],
+            _ => ["z", "y"],
+        };
         let values: Vec<f64> = values.iter().map(|v| f64::from(*v)).collect();
         let scale = ColourScale::values(&values);
         let heatmap = Heatmap {
@@ -126,7 +131,7 @@ pub fn write_report(
             width,
             height,
             values,
-            axes: GridAxes { x0: x.0, dx: x.1, y0: y.0, dy: y.1, unit: "µm".into() },
+            axes: GridAxes { x0: x.0, dx: x.1, y0: y.0, dy: y.1, unit: "µm".into(), names },
             quantity: "g".into(),
             unit: String::new(),
             scale,

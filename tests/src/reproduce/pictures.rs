@@ -60,6 +60,7 @@ impl Field<'_> {
                 y0: from[1] + half,
                 dy: self.pitch,
                 unit: self.length.to_owned(),
+                names: ["x", "y"],
             },
             quantity: self.quantity.to_owned(),
             unit: self.unit.to_owned(),

@@ -112,3 +112,57 @@ fearless_simd::kernel! {
         V::simd_from(s, _mm256_cvtph_ps(packed))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Everything here with one instruction set.
+    struct All;
+
+    impl Kernel for All {
+        type Output = ();
+
+        #[inline(always)]
+        fn run<S: Simd>(self, s: S) {
+            let lanes: [f32; LANES] = std::array::from_fn(|i| i as f32);
+            let mut back = [0f32; LANES];
+            reversed(s, V::from_slice(s, &lanes)).store_slice(&mut back);
+            assert_eq!(back, [7.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.0, 0.0]);
+
+            let rows = std::array::from_fn(|r| {
+                let row: [f32; LANES] = std::array::from_fn(|c| (10 * r + c) as f32);
+                V::from_slice(s, &row)
+            });
+            for (c, column) in transposed(s, rows).iter().enumerate() {
+                column.store_slice(&mut back);
+                assert_eq!(back, std::array::from_fn(|r| (10 * r + c) as f32));
+            }
+
+            for first in (0..=u16::MAX).step_by(LANES) {
+                let halves: [u16; LANES] = std::array::from_fn(|i| first + i as u16);
+                widen(s, halves).store_slice(&mut back);
+                for (h, found) in halves.iter().zip(back) {
+                    let number = half::f16::from_bits(*h);
+                    // what is stored is zero, or normal and finite
+                    if number.is_normal() || h & 0x7fff == 0 {
+                        assert_eq!(found.to_bits(), number.to_f32().to_bits(), "{h:#06x}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn lanes_are_where_they_belong() {
+        let level = Level::new();
+        run(level, All);
+        #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+        if let Some(s) = level.as_sse2() {
+            s.vectorize(
+                #[inline(always)]
+                || All.run(s),
+            );
+        }
+    }
+}

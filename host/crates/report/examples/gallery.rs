@@ -85,6 +85,7 @@ fn map(title: &str, width: usize, height: usize, values: Vec<f64>, scale: Colour
             y0: -6.0,
             dy: 18.4 / width as f64,
             unit: "mm".into(),
+            names: ["x", "y"],
         },
         quantity: "h".into(),
         unit: "mm".into(),
@@ -116,7 +117,7 @@ fn maps() -> Result<Section, Box<dyn Error>> {
     let displacement: Vec<f64> = (0..6400).map(|i| 50.0 + f64::from(i % 80) * 1e-3).collect();
     let mut pixels =
         map("Displacement along x", 80, 80, displacement.clone(), ColourScale::values(&displacement));
-    pixels.axes = GridAxes { x0: 1200.0, dx: 5.0, y0: 40.0, dy: 5.0, unit: "px".into() };
+    pixels.axes = GridAxes { x0: 1200.0, dx: 5.0, y0: 40.0, dy: 5.0, unit: "px".into(), names: ["x", "y"] };
     (pixels.quantity, pixels.unit) = ("u".into(), "µm".into());
     Ok(Section {
         title: "Maps".into(),
@@ -293,7 +294,7 @@ fn surfaces() -> Result<Section, Box<dyn Error>> {
         height: 110,
         scale: ColourScale::values(&values),
         values,
-        axes: GridAxes { x0: -9.2, dx: 0.115, y0: -6.3, dy: 0.115, unit: "mm".into() },
+        axes: GridAxes { x0: -9.2, dx: 0.115, y0: -6.3, dy: 0.115, unit: "mm".into(), names: ["x", "y"] },
         quantity: "h".into(),
         unit: "mm".into(),
     };

@@ -18,6 +18,8 @@ pub struct GridAxes {
     pub dy: f64,
     /// Unit of the axes, "px" or "mm".
     pub unit: String,
+    /// Names of the axes to the right and down, mostly "x" and "y".
+    pub names: [&'static str; 2],
 }
 
 /// A scalar over a grid. Row 0 is drawn on top and column 0 on the left, as in the image, whatever
@@ -117,8 +119,14 @@ impl Heatmap {
             svg.line((left - 5.0, at), (left, at), TICK);
             svg.text(left - 8.0, at + 4.0, SMALL, Anchor::End, &label);
         }
-        svg.text(left + w / 2.0, top + h + 36.0, TEXT, Anchor::Middle, &format!("x / {}", a.unit));
-        svg.text_up(14.0, top + h / 2.0, TEXT, &format!("y / {}", a.unit));
+        svg.text(
+            left + w / 2.0,
+            top + h + 36.0,
+            TEXT,
+            Anchor::Middle,
+            &format!("{} / {}", a.names[0], a.unit),
+        );
+        svg.text_up(14.0, top + h / 2.0, TEXT, &format!("{} / {}", a.names[1], a.unit));
         self.colour_bar(&mut svg, left + w + 18.0, top, h)?;
         Ok(svg.finish())
     }

@@ -9,7 +9,7 @@ use daic_report::{
 const HOSTILE: &str = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(2)>&\u{0}\u{1b}]]>-->";
 
 fn axes() -> GridAxes {
-    GridAxes { x0: 1.0, dx: 0.5, y0: -2.0, dy: 0.5, unit: HOSTILE.into() }
+    GridAxes { x0: 1.0, dx: 0.5, y0: -2.0, dy: 0.5, unit: HOSTILE.into(), names: ["x", "y"] }
 }
 
 fn heatmap(width: usize, height: usize, values: Vec<f64>) -> Heatmap {

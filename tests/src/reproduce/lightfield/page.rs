@@ -168,7 +168,8 @@ fn projection(b: &Boxed, along_z: bool) -> Result<Markup, ReproduceError> {
     let top = values.iter().copied().fold(f64::MIN_POSITIVE, f64::max);
     values.iter_mut().for_each(|v| *v /= top);
     let scale = ColourScale::values(&values);
-    let axes = GridAxes { x0: 0.0, dx, y0, dy, unit: "µm".into() };
+    let axes =
+        GridAxes { x0: 0.0, dx, y0, dy, unit: "µm".into(), names: ["x", if along_z { "y" } else { "z" }] };
     let title = format!("Seven beads, {}: {}", b.name, if along_z { "x and y" } else { "x and depth" });
     let map =
         Heatmap { title, width: nx, height, values, axes, quantity: "g".into(), unit: String::new(), scale };
@@ -206,7 +207,7 @@ fn seven(results: &Results, text: &mut String, figures: &mut Figures) -> Result<
         let values: Vec<f64> = image.iter().map(|v| f64::from(*v)).collect();
         let scale = ColourScale::values(&values);
         let title = format!("Seven beads, view {name}, exact phase");
-        let axes = GridAxes { x0: 0.0, dx: 1.0, y0: 0.0, dy: 1.0, unit: "px".into() };
+        let axes = GridAxes { x0: 0.0, dx: 1.0, y0: 0.0, dy: 1.0, unit: "px".into(), names: ["x", "y"] };
         let (quantity, unit) = ("light".into(), String::new());
         let map =
             Heatmap { title: title.clone(), width: side, height: side, values, axes, quantity, unit, scale };

@@ -347,3 +347,75 @@ impl Stage {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simd::{Kernel, run};
+    use fearless_simd::Level;
+
+    struct Transform<'a> {
+        plan: &'a Plan,
+        source: Source<'a>,
+        inverse: bool,
+    }
+
+    impl Kernel for Transform<'_> {
+        type Output = Vec<[[f32; LANES]; 2]>;
+
+        #[inline(always)]
+        fn run<S: Simd>(self, s: S) -> Self::Output {
+            let mut scratch = vec![0f32; self.plan.scratch()];
+            if self.inverse {
+                self.plan.run::<S, true>(s, &mut scratch, self.source, LANES);
+            } else {
+                self.plan.run::<S, false>(s, &mut scratch, self.source, LANES);
+            }
+            (0..self.plan.n)
+                .map(|i| {
+                    let mut out = [[0f32; LANES]; 2];
+                    let c = result(s, &scratch, i);
+                    c.re.store_slice(&mut out[0]);
+                    c.im.store_slice(&mut out[1]);
+                    out
+                })
+                .collect()
+        }
+    }
+
+    /// Every length up to 200, some numbers missing, against the sum itself in double precision.
+    #[test]
+    fn transforms_are_the_sums() {
+        let mut worst = 0.0f64;
+        for n in (1..=200).filter(|&n| good_length(n) == n) {
+            // two groups of lanes a number, of which the second is transformed
+            let values: Vec<f32> = (0..n * 4 * LANES).map(|i| (i as f32 * 1.7).sin()).collect();
+            let mut offsets: Vec<usize> = (0..n).map(|i| i * 4 * LANES).collect();
+            for i in (3..n).step_by(7) {
+                offsets[i] = NOTHING;
+            }
+            let source = Source { values: &values, offsets: &offsets, imaginary: 2 * LANES };
+            for inverse in [false, true] {
+                let found = run(Level::new(), Transform { plan: &Plan::new(n), source, inverse });
+                for (k, found) in found.iter().enumerate() {
+                    for lane in 0..LANES {
+                        let (mut re, mut im) = (0.0, 0.0);
+                        for (i, at) in offsets.iter().enumerate().filter(|(_, at)| **at != NOTHING) {
+                            let turn = (i * k % n) as f64 / n as f64 * std::f64::consts::TAU;
+                            let (sin, cos) = if inverse { turn } else { -turn }.sin_cos();
+                            let a = f64::from(values[at + LANES + lane]);
+                            let b = f64::from(values[at + 3 * LANES + lane]);
+                            re += a * cos - b * sin;
+                            im += a * sin + b * cos;
+                        }
+                        let off = (f64::from(found[0][lane]) - re).hypot(f64::from(found[1][lane]) - im);
+                        worst = worst.max(off / (n as f64).sqrt());
+                    }
+                }
+            }
+        }
+        println!("largest error over the root of the length {worst:.1e}");
+        // 1.4e-6 is the worst of 49 000 numbers
+        assert!(worst < 1.6e-6, "{worst:e}");
+    }
+}

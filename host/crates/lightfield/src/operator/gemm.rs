@@ -236,3 +236,87 @@ fn columns<S: Simd, const N: usize>(s: S, a: &[f32], rows: &[V<S>; LANES], y: &m
         sum[n].store_slice(&mut y[n]);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simd::{Kernel, run};
+    use fearless_simd::Level;
+
+    struct Product<'a, T> {
+        block: Block,
+        a: &'a [T],
+        x: &'a [f32],
+        vectors: usize,
+        transposed: bool,
+    }
+
+    impl<T: Element> Kernel for Product<'_, T> {
+        type Output = Vec<f32>;
+
+        #[inline(always)]
+        fn run<S: Simd>(self, s: S) -> Vec<f32> {
+            let mut y = vec![f32::NAN; VECTORS * self.block.padded_rows().max(self.block.columns)];
+            if self.transposed {
+                self.block.multiply_transposed(s, self.a, self.x, &mut y);
+            } else {
+                self.block.multiply(s, self.a, self.x, &mut y, self.vectors);
+            }
+            y
+        }
+    }
+
+    /// Sums with whole numbers, which are exact in any order, over sizes with all kinds of remainders.
+    fn products<T: Element>() {
+        for rows in [1, 7, 8, 9, 24, 31, 41] {
+            for columns in [1, 3, 4, 5, 6, 11, 24, 25, 31, 50] {
+                let block = Block { rows, columns };
+                let value = |r: usize, c: usize| ((r * 7 + c * 3) % 11) as f32 - 5.0;
+                let mut a = vec![T::default(); block.len()];
+                for r in 0..rows {
+                    for c in 0..columns {
+                        a[block.index(r, c)] = T::of(value(r, c));
+                    }
+                }
+                let tall = block.padded_rows();
+                let x: Vec<f32> =
+                    (0..VECTORS * tall.max(columns)).map(|i| ((i * 5) % 17) as f32 - 8.0).collect();
+                for vectors in 1..=VECTORS {
+                    let y = run(Level::new(), Product { block, a: &a, x: &x, vectors, transposed: false });
+                    for (r, v) in (0..rows).flat_map(|r| (0..vectors).map(move |v| (r, v))) {
+                        let sum: f32 = (0..columns).map(|c| value(r, c) * x[c * VECTORS + v]).sum();
+                        assert_eq!(y[v * tall + r], sum, "{block:?}, {vectors} vectors, row {r} of {v}");
+                    }
+                    let padding = (rows..tall).flat_map(|r| (0..vectors).map(move |v| v * tall + r));
+                    assert!(padding.into_iter().all(|i| y[i] == 0.0), "{block:?}: padding");
+                }
+                let y = run(Level::new(), Product { block, a: &a, x: &x, vectors: 8, transposed: true });
+                for (c, v) in (0..columns).flat_map(|c| (0..VECTORS).map(move |v| (c, v))) {
+                    let sum: f32 = (0..rows).map(|r| value(r, c) * x[r * VECTORS + v]).sum();
+                    assert_eq!(y[c * VECTORS + v], sum, "{block:?}, transposed, column {c} of {v}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn products_are_the_sums() {
+        products::<f32>();
+        products::<Half>();
+    }
+
+    /// Numbers that round: each vector's result is the same whichever others go with it.
+    #[test]
+    fn vectors_do_not_know_each_other() {
+        let block = Block { rows: 45, columns: 29 };
+        let a: Vec<f32> = (0..block.len()).map(|i| (i as f32 * 0.37).sin()).collect();
+        let x: Vec<f32> = (0..VECTORS * 48).map(|i| (i as f32 * 0.73).cos()).collect();
+        let y = |vectors| run(Level::new(), Product { block, a: &a, x: &x, vectors, transposed: false });
+        let all = y(VECTORS);
+        for vectors in 1..VECTORS {
+            let some = y(vectors);
+            let n = vectors * block.padded_rows();
+            assert_eq!(some[..n], all[..n], "{vectors} vectors");
+        }
+    }
+}

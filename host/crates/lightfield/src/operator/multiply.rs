@@ -212,3 +212,66 @@ fn store<S: Simd>(s: S, rows: [V<S>; VECTORS], to: &mut [f32]) {
         row.store_slice(to);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::operator::basis::Cell;
+    use crate::operator::blocks::{Orbits, Reduction};
+    use crate::simd::run;
+    use fearless_simd::Level;
+
+    struct ThereAndBack<'a>(&'a Table, &'a [f32], usize);
+
+    impl Work for ThereAndBack<'_> {
+        /// The vector, and what it becomes again, times 2.
+        type Output = [Vec<f32>; 2];
+
+        #[inline(always)]
+        fn run<S: Simd>(self, s: S) -> Self::Output {
+            let Self(table, spectrum, c) = self;
+            let (mut vector, mut back) = (vec![0f32; 2 * c], vec![f32::NAN; 2 * c]);
+            let mut turned = vec![9f32; 2 * c];
+            let ordered = table.ordered(s, spectrum, &mut turned).to_vec();
+            for at in (0..c).step_by(LANES) {
+                let [re, im] = table.apply(s, &ordered, at, V::splat(s, table.sign));
+                re.store_slice(&mut vector[at..at + LANES]);
+                im.store_slice(&mut vector[c + at..c + at + LANES]);
+            }
+            table.undo(s, &vector, &mut back, &mut turned, 2.0);
+            [vector, back]
+        }
+    }
+
+    /// Spectra become vectors and spectra again, nothing rounded, the padding zero; no step but the first is
+    /// the same as another.
+    #[test]
+    fn steps_are_undone() {
+        let reductions = [
+            (Reduction::Complex, false),
+            (Reduction::ComplexMirrorX, false),
+            (Reduction::ComplexMirrorY, false),
+            (Reduction::Real, true),
+            (Reduction::RealMirrors, true),
+            (Reduction::RealSquare, true),
+        ];
+        for (reduction, real) in reductions {
+            for (n, inner) in [(3, 17), (4, 2), (5, 1), (2, 9), (3, 1), (15, 1)] {
+                let cell = Cell { n: [n, n], inner };
+                let c = cell.channels().next_multiple_of(LANES);
+                let mut spectrum: Vec<f32> = (0..2 * c).map(|i| (i as f32 * 0.9).sin()).collect();
+                for part in spectrum.chunks_exact_mut(c) {
+                    part[cell.channels()..].fill(0.0);
+                }
+                let mut seen: Vec<Vec<f32>> = Vec::new();
+                for table in Orbits::new([12, 12], reduction).tables(&cell, c, real) {
+                    let [vector, back] = run(Level::new(), ThereAndBack(&table, &spectrum, c));
+                    let twice: Vec<f32> = spectrum.iter().map(|v| 2.0 * v).collect();
+                    assert_eq!(back, twice, "{reduction:?} {cell:?}");
+                    assert!(!seen.contains(&vector), "{reduction:?} {cell:?}");
+                    seen.push(vector);
+                }
+            }
+        }
+    }
+}
