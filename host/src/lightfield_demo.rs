@@ -141,6 +141,7 @@ fn options(frames: Vec<PathBuf>, folder: &Path, lattice: &Lattice, white: PathBu
         settings: Settings { clip_negative: true, ..Settings::new(Method::Rl, ITERATIONS) },
         background: 0.0,
         border: 0,
+        inset: 0,
         storage: Storage::F32,
         memory_limit: None,
         formats: vec![Format::Tiff],

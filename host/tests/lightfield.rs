@@ -206,6 +206,19 @@ fn from_white_image_to_volume() {
     let [_, y, x] = highest(&values, shape);
     assert_eq!([y, x], [11 * S - 1 - at[1], 11 * S - 1 - at[2]]);
 
+    // ISRA says which way it went; by the stored normal matrix, where the sensor catches all light
+    save(&path("ideal.png"), 11 * N, &image, 30_000.0 / largest);
+    let isra = |out: &str, more: &[&str]| {
+        run(&command("ideal.png", out, &[&["--method", "isra", "--background", "0"], more].concat()))
+    };
+    let said = isra("c", &[])["path"].clone();
+    assert!(said.as_str().expect("words").contains("does not catch all light"), "{said}");
+    let said = isra("d", &["--inset", "2"])["path"].clone();
+    assert!(said.as_str().expect("words").contains("normal matrix"), "{said}");
+    let (values, inner) = read_stack(&path("d/ideal.tif")).expect("stack");
+    assert_eq!(inner, [PLANES, 7 * S, 7 * S]);
+    assert_eq!(highest(&values, inner), [at[0], at[1] - 2 * S, at[2] - 2 * S]);
+
     let (lattice, white) = (path("lattice.toml"), path("white.png"));
     let corrected = ["--lattice", text(&lattice), "--white", text(&white)];
     run(&command("seen.png", "b", &[&corrected[..], &["--storage", "f16", "--momentum"]].concat()));
@@ -270,6 +283,9 @@ fn bad_input_is_named_and_leaves_nothing() {
     // memory
     let said = reconstruct(&good, &frame, &[psf[0], psf[1], "--memory", "0"]);
     assert!(said.contains("MiB"), "{said}");
+    // nothing left
+    let said = reconstruct(&good, &frame, &[psf[0], psf[1], "--inset", "6"]);
+    assert!(said.contains("inset of 6") && said.contains("nothing of 11 11"), "{said}");
     // planes that the stored point spread function does not have
     let deeper = setup(dir.path(), "deeper.toml", &[("last_um = 10.0", "last_um = 15.0")]);
     let said = reconstruct(&deeper, &frame, &psf);

@@ -157,7 +157,11 @@ struct ReconstructArgs {
     clip_negative: bool,
     /// Lenslets around the sensor from which light may come too
     #[arg(long, value_name = "CELLS", default_value_t = 0)]
-    border: usize,
+    border: u16,
+    /// Lenslets at the edge of the sensor above which nothing is that gives light; as many as the point spread
+    /// function's radius, and `isra` goes through the stored normal matrix
+    #[arg(long, value_name = "CELLS", default_value_t = 0, conflicts_with = "border")]
+    inset: u16,
     /// Storage of the operator
     #[arg(long, value_enum, default_value = "f32")]
     storage: StorageArg,
@@ -307,7 +311,8 @@ fn reconstruct(a: &ReconstructArgs, output: &Output) -> Result<Answer, Error> {
             )
         },
         background: a.background,
-        border: a.border,
+        border: a.border.into(),
+        inset: a.inset.into(),
         storage: match a.storage {
             StorageArg::F32 => Storage::F32,
             StorageArg::F16 => Storage::F16,

@@ -38,6 +38,14 @@ pub enum LightFieldError {
         /// First part that differs.
         what: &'static str,
     },
+    /// Nothing is left of the volume.
+    #[error("an inset of {inset} lenslets on each side leaves nothing of {} × {}", cells[1], cells[0])]
+    Inset {
+        /// Lenslets on each side.
+        inset: usize,
+        /// Lenslets (y, x) of the frames.
+        cells: [usize; 2],
+    },
     /// A state that cannot be gone on from.
     #[error("{} cannot be continued: {reason}; begin anew with --overwrite", path.display())]
     State {

@@ -38,6 +38,9 @@ pub struct Options {
     pub background: f32,
     /// Cells around the sensor in which light may start too; they are cut off afterwards.
     pub border: usize,
+    /// Cells at the edge of the sensor above which no light starts. Where they are as many as the radius of the
+    /// point spread function, the sensor catches all light.
+    pub inset: usize,
     /// Storage of the operator.
     pub storage: Storage,
     /// Bytes that the operator may take.
@@ -99,6 +102,8 @@ struct Key<'a> {
     settings: &'a Settings,
     background: f32,
     border: usize,
+    inset: usize,
+    psf: String,
     storage: Storage,
     lattice: &'a Option<daic_lightfield::lattice::Lattice>,
     crop: Option<[[usize; 2]; 2]>,
@@ -146,15 +151,19 @@ pub fn run(setup: &Setup, options: &Options, progress: &dyn Progress) -> Result<
     let cells = reader.read(first)?.cells;
     let psf_path = options.psf.clone().unwrap_or_else(|| options.out.join("psf.bin"));
     let (psf, psf_reused) = psf_file::obtain(Some(&psf_path), &parameters, options.force_psf, progress)?;
+    if cells.iter().any(|c| *c <= 2 * options.inset) {
+        return Err(LightFieldError::Inset { inset: options.inset, cells }.into());
+    }
+    let inner = cells.map(|c| c - 2 * options.inset);
     let operator_settings = OperatorSettings {
-        margin: -(options.border as isize),
+        margin: options.inset as isize - options.border as isize,
         storage: options.storage,
         memory_limit: options.memory_limit,
-        ..OperatorSettings::new(cells.map(|c| c + 2 * options.border))
+        ..OperatorSettings::new(inner.map(|c| c + 2 * options.border))
     };
     let memory = Operator::estimate(&psf, &operator_settings).map_err(LightFieldError::from)?;
     let voxels = parameters.voxels;
-    let volume = [parameters.planes_um.len(), cells[0] * voxels[0], cells[1] * voxels[1]];
+    let volume = [parameters.planes_um.len(), inner[0] * voxels[0], inner[1] * voxels[1]];
     let mut summary = Summary {
         memory,
         peak_bytes: memory.peak(),
@@ -179,6 +188,8 @@ pub fn run(setup: &Setup, options: &Options, progress: &dyn Progress) -> Result<
         settings: &options.settings,
         background: options.background,
         border: options.border,
+        inset: options.inset,
+        psf: hash_file(&psf_path)?,
         storage: options.storage,
         lattice: &options.corrections.lattice,
         crop: options.corrections.crop,
@@ -399,7 +410,8 @@ impl Batch<'_> {
     fn write(&self, i: usize, state: State, residuals: Vec<f64>, changes: Vec<f64>) -> Result<Done, Error> {
         let (name, out) = (&self.names[i], &self.options.out);
         let p = &self.psf.parameters;
-        let shape = [p.planes_um.len(), self.cells[0] * p.voxels[0], self.cells[1] * p.voxels[1]];
+        let inner = self.cells.map(|c| c - 2 * self.options.inset);
+        let shape = [p.planes_um.len(), inner[0] * p.voxels[0], inner[1] * p.voxels[1]];
         let values = without_border(&state.volume, shape, p.voxels.map(|v| v * self.options.border));
         let volume = Volume {
             shape,

@@ -1,91 +1,10 @@
 //! Projections against independent arrays and against themselves.
 
 mod common;
-use common::{f32s, f64s, relative, shared};
-use daic_lightfield::{
-    Direct, Operator, OperatorSettings, Oversampling, Psf, PsfParameters, PsfReport, Radius, Reduction,
-    Storage,
-};
-use rand::{RngExt, SeedableRng};
+use common::{Case, f32s, f64s, psf_of, random, relative, shared, symmetric};
+use daic_lightfield::{Direct, Operator, OperatorSettings, Reduction, Storage};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-
-/// A point spread function of given values and sizes.
-fn psf_of(pixels: [usize; 2], voxels: [usize; 2], planes: usize, radius: usize, values: Vec<f32>) -> Psf {
-    let planes_um = (0..planes).map(|z| z as f64).collect();
-    let parameters = PsfParameters {
-        pixels,
-        voxels,
-        radius: Radius::Cells(radius),
-        oversampling: Oversampling::Samples(5),
-        ..PsfParameters::thesis(planes_um)
-    };
-    let report = PsfReport {
-        samples: 5,
-        dx_um: 2.0,
-        sampling_error: 0.0,
-        quadrature_error: 0.0,
-        plane_radius: vec![radius; planes],
-        energy: vec![1.0; planes],
-        evanescent: 0.0,
-    };
-    Psf::from_values(parameters, report, radius, values).unwrap()
-}
-
-/// Sizes of a random point spread function and the symmetry it is given.
-#[derive(Debug, Clone, Copy)]
-struct Case {
-    pixels: [usize; 2],
-    voxels: [usize; 2],
-    planes: usize,
-    radius: usize,
-    cells: [usize; 2],
-    margin: isize,
-    symmetry: Reduction,
-}
-
-fn random(rng: &mut ChaCha8Rng, n: usize) -> Vec<f32> {
-    (0..n).map(|_| rng.random_range(0.0..1.0)).collect()
-}
-
-/// Random values with exactly the symmetry of a reduction.
-fn symmetric(rng: &mut ChaCha8Rng, case: &Case) -> Psf {
-    let side = 2 * case.radius + 1;
-    let ([vy, vx], [py, px]) = (case.voxels, case.pixels);
-    let count = case.planes * vy * vx * side * side * py * px;
-    let noise = random(rng, count);
-    let mut values = vec![0f32; count];
-    let place = |z: usize, y: [usize; 3], x: [usize; 3]| {
-        (((((z * vy + y[0]) * vx + x[0]) * side + y[1]) * side + x[1]) * py + y[2]) * px + x[2]
-    };
-    let flip = |v: [usize; 3], n: [usize; 3]| [n[0] - 1 - v[0], n[1] - 1 - v[1], n[2] - 1 - v[2]];
-    let (ny, nx) = ([vy, side, py], [vx, side, px]);
-    for z in 0..case.planes {
-        for i in 0..vy * side * py {
-            for j in 0..vx * side * px {
-                let y = [i / (side * py), i / py % side, i % py];
-                let x = [j / (side * px), j / px % side, j % px];
-                let mut images = vec![(y, x)];
-                let s = case.symmetry;
-                if matches!(s, Reduction::ComplexMirrorY | Reduction::RealMirrors | Reduction::RealSquare) {
-                    images.extend(images.clone().iter().map(|&(y, x)| (flip(y, ny), x)));
-                }
-                if matches!(s, Reduction::ComplexMirrorX | Reduction::RealMirrors | Reduction::RealSquare) {
-                    images.extend(images.clone().iter().map(|&(y, x)| (y, flip(x, nx))));
-                }
-                if s == Reduction::RealSquare {
-                    images.extend(images.clone().iter().map(|&(y, x)| (x, y)));
-                }
-                if s == Reduction::Real {
-                    images.push((flip(y, ny), flip(x, nx)));
-                }
-                let mut places: Vec<usize> = images.iter().map(|&(y, x)| place(z, y, x)).collect();
-                places.sort_unstable();
-                values[place(z, y, x)] = noise[places[0]];
-            }
-        }
-    }
-    psf_of(case.pixels, case.voxels, case.planes, case.radius, values)
-}
 
 fn dot(a: &[f32], b: &[f32]) -> f64 {
     a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
@@ -203,20 +122,6 @@ fn tiles_give_the_same() {
     let psf = symmetric(&mut rng, &CASES[0]);
     let small = OperatorSettings { memory_limit: Some(1000), ..OperatorSettings::new([9, 9]) };
     assert!(Operator::new(&psf, &small).is_err());
-}
-
-#[test]
-fn results_do_not_depend_on_threads() {
-    let mut rng = ChaCha8Rng::seed_from_u64(4);
-    let psf = symmetric(&mut rng, &CASES[5]);
-    let settings = OperatorSettings::new([6, 5]);
-    let operator = Operator::new(&psf, &settings).unwrap();
-    let g = random(&mut rng, operator.volume_shape().iter().product());
-    let with = |n: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
-        pool.install(|| Operator::new(&psf, &settings).unwrap().project(&[&g]).unwrap())
-    };
-    assert_eq!(with(1), with(3));
 }
 
 #[test]

@@ -142,8 +142,8 @@ fn folded<S: Simd>(s: S, row: &mut [f32]) {
 #[cfg(test)]
 mod tests {
     use super::Cell;
-    use crate::simd::{Kernel, run};
-    use fearless_simd::{Level, Simd};
+    use crate::simd::{Kernel, levels, run};
+    use fearless_simd::Simd;
 
     struct With<'a>(Cell, &'a mut [f32]);
 
@@ -161,10 +161,13 @@ mod tests {
         for (ny, nx, inner) in (1..36).flat_map(|n| [(n, n, 1), (3, n, 1), (n, 3, 5), (3, 4, n)]) {
             let cell = Cell { n: [ny, nx], inner };
             let values: Vec<f32> = (0..cell.channels()).map(|i| (i as f32 * 0.7).sin()).collect();
-            let (mut plain, mut vectors) = (values.clone(), values.clone());
+            let mut plain = values.clone();
             cell.butterfly(&mut plain);
-            run(Level::new(), With(cell, &mut vectors));
-            assert_eq!(plain, vectors, "{cell:?}");
+            for level in levels() {
+                let mut vectors = values.clone();
+                run(level, With(cell, &mut vectors));
+                assert_eq!(plain, vectors, "{level:?} {cell:?}");
+            }
             cell.butterfly(&mut plain);
             for (c, (twice, v)) in plain.iter().zip(&values).enumerate() {
                 assert!((twice - cell.weight(c) * v).abs() < 1e-6, "{cell:?} {c}");

@@ -59,7 +59,8 @@ pub(crate) struct Spectra {
 /// The first `n` numbers of a buffer that grows when it has to: volumes and sensors take turns.
 fn room(buffer: &mut Vec<f32>, n: usize) -> &mut [f32] {
     if buffer.len() < n {
-        buffer.resize(n, 0.0);
+        // fresh memory is zero without being written
+        *buffer = vec![0.0; n];
     }
     &mut buffer[..n]
 }

@@ -240,7 +240,7 @@ fn columns<S: Simd, const N: usize>(s: S, a: &[f32], rows: &[V<S>; LANES], y: &m
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simd::{Kernel, run};
+    use crate::simd::{Kernel, levels, run};
     use fearless_simd::Level;
 
     struct Product<'a, T> {
@@ -267,7 +267,7 @@ mod tests {
     }
 
     /// Sums with whole numbers, which are exact in any order, over sizes with all kinds of remainders.
-    fn products<T: Element>() {
+    fn products<T: Element>(level: Level) {
         for rows in [1, 7, 8, 9, 24, 31, 41] {
             for columns in [1, 3, 4, 5, 6, 11, 24, 25, 31, 50] {
                 let block = Block { rows, columns };
@@ -282,7 +282,7 @@ mod tests {
                 let x: Vec<f32> =
                     (0..VECTORS * tall.max(columns)).map(|i| ((i * 5) % 17) as f32 - 8.0).collect();
                 for vectors in 1..=VECTORS {
-                    let y = run(Level::new(), Product { block, a: &a, x: &x, vectors, transposed: false });
+                    let y = run(level, Product { block, a: &a, x: &x, vectors, transposed: false });
                     for (r, v) in (0..rows).flat_map(|r| (0..vectors).map(move |v| (r, v))) {
                         let sum: f32 = (0..columns).map(|c| value(r, c) * x[c * VECTORS + v]).sum();
                         assert_eq!(y[v * tall + r], sum, "{block:?}, {vectors} vectors, row {r} of {v}");
@@ -290,7 +290,7 @@ mod tests {
                     let padding = (rows..tall).flat_map(|r| (0..vectors).map(move |v| v * tall + r));
                     assert!(padding.into_iter().all(|i| y[i] == 0.0), "{block:?}: padding");
                 }
-                let y = run(Level::new(), Product { block, a: &a, x: &x, vectors: 8, transposed: true });
+                let y = run(level, Product { block, a: &a, x: &x, vectors: 8, transposed: true });
                 for (c, v) in (0..columns).flat_map(|c| (0..VECTORS).map(move |v| (c, v))) {
                     let sum: f32 = (0..rows).map(|r| value(r, c) * x[r * VECTORS + v]).sum();
                     assert_eq!(y[c * VECTORS + v], sum, "{block:?}, transposed, column {c} of {v}");
@@ -301,8 +301,10 @@ mod tests {
 
     #[test]
     fn products_are_the_sums() {
-        products::<f32>();
-        products::<Half>();
+        for level in levels() {
+            products::<f32>(level);
+            products::<Half>(level);
+        }
     }
 
     /// Numbers that round: each vector's result is the same whichever others go with it.

@@ -31,6 +31,9 @@ impl Table {
         let c = from.len() / 2;
         let (re, im) = turned.split_at_mut(c);
         let (from_re, from_im) = from.split_at(c);
+        let channels = list.len() * self.run;
+        re[channels..].fill(0.0);
+        im[channels..].fill(0.0);
         if self.run == 1 {
             for ((re, im), &at) in re.iter_mut().zip(im).zip(list) {
                 (*re, *im) = (from_re[at as usize], from_im[at as usize]);
@@ -218,8 +221,7 @@ mod tests {
     use super::*;
     use crate::operator::basis::Cell;
     use crate::operator::blocks::{Orbits, Reduction};
-    use crate::simd::run;
-    use fearless_simd::Level;
+    use crate::simd::{levels, run};
 
     struct ThereAndBack<'a>(&'a Table, &'a [f32], usize);
 
@@ -264,10 +266,14 @@ mod tests {
                     part[cell.channels()..].fill(0.0);
                 }
                 let mut seen: Vec<Vec<f32>> = Vec::new();
+                let twice: Vec<f32> = spectrum.iter().map(|v| 2.0 * v).collect();
                 for table in Orbits::new([12, 12], reduction).tables(&cell, c, real) {
-                    let [vector, back] = run(Level::new(), ThereAndBack(&table, &spectrum, c));
-                    let twice: Vec<f32> = spectrum.iter().map(|v| 2.0 * v).collect();
-                    assert_eq!(back, twice, "{reduction:?} {cell:?}");
+                    let mut vector = Vec::new();
+                    for level in levels() {
+                        let back;
+                        [vector, back] = run(level, ThereAndBack(&table, &spectrum, c));
+                        assert_eq!(back, twice, "{level:?} {reduction:?} {cell:?}");
+                    }
                     assert!(!seen.contains(&vector), "{reduction:?} {cell:?}");
                     seen.push(vector);
                 }

@@ -19,18 +19,13 @@ pub(super) fn clip(image: &mut [f32]) -> (f64, f32) {
         #[inline(always)]
         fn run<S: Simd>(self, _: S) -> Self::Output {
             let (mut squares, mut largest) = ([0f64; LANES], [0f32; LANES]);
-            let (parts, rest) = self.0.as_chunks_mut::<LANES>();
-            for part in parts {
+            // packed images are made of whole lanes
+            for part in self.0.as_chunks_mut::<LANES>().0 {
                 for j in 0..LANES {
                     part[j] = part[j].max(0.0);
                     squares[j] += f64::from(part[j]) * f64::from(part[j]);
                     largest[j] = largest[j].max(part[j]);
                 }
-            }
-            for (j, v) in rest.iter_mut().enumerate() {
-                *v = v.max(0.0);
-                squares[j] += f64::from(*v) * f64::from(*v);
-                largest[j] = largest[j].max(*v);
             }
             (squares.iter().sum(), largest.iter().copied().fold(0.0, f32::max))
         }
@@ -44,10 +39,11 @@ pub(super) fn pixels(
     settings: &Settings,
     floor: f32,
     values: &mut [f32],
-    [f, b, w]: [Option<&[f32]>; 3],
+    f: &[f32],
+    b: Option<&[f32]>,
+    w: Option<&[f32]>,
 ) -> f64 {
     let rl = settings.method == Method::Rl;
-    let f = f.unwrap_or_default();
     run(Level::new(), Pixels { rl, variance: settings.read_variance, floor, values, f, b, w })
 }
 
@@ -180,5 +176,86 @@ impl Voxels<'_> {
         }
         let rest = |v: [f32; LANES]| v.iter().map(|s| f64::from(*s)).sum::<f64>();
         (total + rest(change), norm + rest(size))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn numbers(seed: f32) -> Vec<f32> {
+        // more than 64 groups of lanes: the sums in single precision are emptied on the way
+        (0..70 * LANES).map(|i| (i as f32 * seed).sin().abs() + 0.1).collect()
+    }
+
+    fn near(a: f64, b: f64) {
+        assert!((a - b).abs() <= 2e-6 * b.abs(), "{a} {b}");
+    }
+
+    #[test]
+    fn pixels_obey_their_formula() {
+        let (f, b, w, before) = (numbers(0.7), numbers(1.3), numbers(2.1), numbers(0.3));
+        for method in [Method::Rl, Method::Isra] {
+            for (b, w) in [(None, None), (Some(&b), None), (None, Some(&w)), (Some(&b), Some(&w))] {
+                let settings = Settings { read_variance: 0.5, ..Settings::new(method, 1) };
+                let mut values = before.clone();
+                let found = pixels(&settings, 0.9, &mut values, &f, b.map(|b| &b[..]), w.map(|w| &w[..]));
+                let mut sum = 0.0;
+                for i in 0..f.len() {
+                    let (b, w) = (b.map_or(0.0, |b| b[i]), w.map_or(1.0, |w| w[i]));
+                    sum += f64::from(w * (f[i] - before[i] - b).powi(2));
+                    let expected = match method {
+                        Method::Rl => w * (f[i] + 0.5) / (before[i] + b + 0.5).max(0.9),
+                        Method::Isra => w * before[i],
+                    };
+                    near(values[i].into(), expected.into());
+                }
+                near(found, sum);
+            }
+        }
+    }
+
+    #[test]
+    fn voxels_obey_their_formula() {
+        let (back, factors, tv, before) = (numbers(0.9), numbers(1.1), numbers(1.7), numbers(0.4));
+        for method in [Method::Rl, Method::Isra] {
+            for tv in [None, Some(&tv)] {
+                let mut x = before.clone();
+                let found = voxels(method, &back, &factors, tv.map(|t| &t[..]), &mut x);
+                let mut sums = (0.0, 0.0);
+                for i in 0..x.len() {
+                    let step = match method {
+                        Method::Rl => back[i] * factors[i],
+                        Method::Isra => factors[i] / back[i],
+                    };
+                    let expected = f64::from(before[i] * step) * f64::from(tv.map_or(1.0, |t| t[i]));
+                    near(x[i].into(), expected);
+                    sums.0 += f64::from(x[i] - before[i]).powi(2);
+                    sums.1 += f64::from(x[i]).powi(2);
+                }
+                near(found.0, sums.0);
+                near(found.1, sums.1);
+            }
+        }
+    }
+
+    #[test]
+    fn images_are_clipped() {
+        let mut image: Vec<f32> = numbers(0.7).iter().map(|v| v - 0.6).collect();
+        let expected: Vec<f32> = image.iter().map(|v| v.max(0.0)).collect();
+        let (squares, largest) = clip(&mut image);
+        assert_eq!(image, expected);
+        assert_eq!(largest, expected.iter().copied().fold(0.0, f32::max));
+        near(squares, expected.iter().map(|v| f64::from(*v).powi(2)).sum());
+    }
+
+    #[test]
+    fn one_number_is_found() {
+        for at in [0, 1023, 1024, 2999] {
+            let mut values = vec![1f32; 3000];
+            assert!(!any(&values, |v| v < 0.0));
+            values[at] = -1.0;
+            assert!(any(&values, |v| v < 0.0));
+        }
     }
 }

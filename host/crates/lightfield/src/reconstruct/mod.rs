@@ -237,53 +237,51 @@ pub fn reconstruct(
     let mut passes = Passes::new(model, frames.len());
     let path = choose(model, settings, weights.is_some());
     let normal = if path == Path::Normal { model.normal.as_ref() } else { None };
+    let at = |row: usize| row * sensor.row()..(row + 1) * sensor.row();
+    let seen_by = |image: usize, row: usize, values: &mut [f32]| match &weights {
+        Some(w) => values.copy_from_slice(&w[image][at(row)]),
+        None => values.fill(1.0),
+    };
     // Hᵀw for Richardson–Lucy, Hᵀ(w (f − b)) for ISRA
     let fixed = passes.back_project(&volume, &|image, row, values| {
-        let at = row * sensor.row()..(row + 1) * sensor.row();
         if settings.method == Method::Rl {
-            match &weights {
-                Some(w) => values.copy_from_slice(&w[image][at]),
-                None => values.fill(1.0),
-            }
-            return;
+            return seen_by(image, row, values);
         }
-        values.copy_from_slice(&images[image][at.clone()]);
+        values.copy_from_slice(&images[image][at(row)]);
         if let Some(b) = &background {
-            for (v, b) in values.iter_mut().zip(&b[image][at.clone()]) {
+            for (v, b) in values.iter_mut().zip(&b[image][at(row)]) {
                 *v = (*v - b).max(0.0);
             }
         }
         if let Some(w) = &weights {
-            for (v, w) in values.iter_mut().zip(&w[image][at]) {
+            for (v, w) in values.iter_mut().zip(&w[image][at(row)]) {
                 *v *= w;
             }
         }
     });
+    // Hᵀw; none where it is `fixed` itself, or where a sensor that catches all light sees every voxel
     let seen = match (settings.method, &path) {
-        (Method::Rl, _) => fixed.clone(),
-        // a sensor that catches all light sees every voxel
-        (Method::Isra, Path::Normal) => vec![vec![1f32; volume.len()]; frames.len()],
-        (Method::Isra, Path::TwoPasses { .. }) => passes.back_project(&volume, &|image, row, values| {
-            let at = row * sensor.row()..(row + 1) * sensor.row();
-            match &weights {
-                Some(w) => values.copy_from_slice(&w[image][at]),
-                None => values.fill(1.0),
-            }
-        }),
+        (Method::Rl, _) | (Method::Isra, Path::Normal) => None,
+        (Method::Isra, Path::TwoPasses { .. }) => Some(passes.back_project(&volume, &seen_by)),
     };
     let mut xs: Vec<Vec<f32>> = match start {
         Some(states) => states.iter().map(|s| volume.pack(&s.volume)).collect(),
-        None => vec![vec![1f32; volume.len()]; frames.len()],
+        // the padding stays zero
+        None => vec![volume.pack(&vec![1f32; model.operator.volume_shape().iter().product()]); frames.len()],
     };
     // factor of an update: 1/Hᵀw, or Hᵀ(w f); zero for voxels that are not seen
     let mut factors = fixed;
-    for ((factor, seen), x) in factors.iter_mut().zip(&seen).zip(&mut xs) {
-        let best = seen.iter().copied().fold(0.0f32, f32::max);
-        for ((f, s), x) in factor.iter_mut().zip(seen).zip(x) {
-            if *s <= UNSEEN * best {
+    let largest = |v: &[f32]| v.iter().copied().fold(0.0f32, f32::max);
+    for (i, (factor, x)) in factors.iter_mut().zip(&mut xs).enumerate() {
+        if settings.method == Method::Rl {
+            let best = largest(factor);
+            for (f, x) in factor.iter_mut().zip(x) {
+                (*f, *x) = if *f <= UNSEEN * best { (0.0, 0.0) } else { (1.0 / f.max(FLOOR), *x) };
+            }
+        } else if let Some(seen) = seen.as_ref().map(|s| &s[i]) {
+            let best = largest(seen);
+            for ((f, x), _) in factor.iter_mut().zip(x).zip(seen).filter(|(_, s)| **s <= UNSEEN * best) {
                 (*f, *x) = (0.0, 0.0);
-            } else if settings.method == Method::Rl {
-                *f = 1.0 / f.max(FLOOR);
             }
         }
     }
@@ -299,7 +297,8 @@ pub fn reconstruct(
     let mut residuals = vec![Vec::new(); frames.len()];
     let mut changes = vec![Vec::new(); frames.len()];
     let mut done = before;
-    let mut points = xs.clone();
+    // where the next step is taken from; without momentum the volumes themselves
+    let mut points = if settings.momentum { xs.clone() } else { std::mem::take(&mut xs) };
     if settings.momentum {
         for ((point, x), m) in points.iter_mut().zip(&xs).zip(&momentum) {
             if let Some([ahead, _]) = m {
@@ -315,11 +314,10 @@ pub fn reconstruct(
         });
         if normal.is_none() {
             let rows = passes.forward(&points, &|image, row, values| {
-                let at = row * sensor.row()..(row + 1) * sensor.row();
-                let f = &images[image][at.clone()];
-                let b = background.as_ref().map(|b| &b[image][at.clone()]);
-                let w = weights.as_ref().map(|w| &w[image][at.clone()]);
-                kernels::pixels(settings, floors[image], values, [Some(f), b, w])
+                let f = &images[image][at(row)];
+                let b = background.as_ref().map(|b| &b[image][at(row)]);
+                let w = weights.as_ref().map(|w| &w[image][at(row)]);
+                kernels::pixels(settings, floors[image], values, f, b, w)
             });
             for (i, list) in residuals.iter_mut().enumerate() {
                 let of = i * orders..(i + 1) * orders;
@@ -390,7 +388,7 @@ fn choose(model: &Model, settings: &Settings, weighted: bool) -> Path {
     }
     let no = |reason: &str| Path::TwoPasses { reason: Some(reason.to_owned()) };
     let g = &model.operator.geometry;
-    if !settings.use_normal || model.normal.is_none() {
+    if !settings.use_normal {
         return Path::TwoPasses { reason: None };
     }
     if weighted {
@@ -401,6 +399,9 @@ fn choose(model: &Model, settings: &Settings, weighted: bool) -> Path {
     }
     if settings.residual_below.is_some() {
         return no("a residual is asked for, which the normal matrix does not give");
+    }
+    if model.normal.is_none() {
+        return no("none is stored; of two orders it needs a point spread function with a mirror in y");
     }
     Path::Normal
 }
