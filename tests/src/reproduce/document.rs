@@ -24,8 +24,8 @@ const HEAD: &str = "\
 
 Written by `cargo xtask reproduce macro`, `cargo xtask reproduce micro` and `cargo xtask reproduce lightfield`; not to be edited by hand. The set-ups of chapters 2 and 3
 are simulated ray by ray through the grating equation and measured with the project's own correlation, calibration and decoding; those of chapter 4 by wave optics, with finer sampling
-than the reconstructions use. Seeds are fixed: the same source gives the same numbers on every machine. \"Thesis\" are the values printed there: measured on real specimens
-in chapters 2 and 3, simulated in chapter 4 but for figure 15.
+than the reconstructions use. Seeds are fixed: the same source gives the same numbers on every machine; those of chapter 4 are rounded differently by
+processors with other vector instructions, which may change the last digit shown. \"Thesis\" are the values printed there: measured on real specimens in chapters 2 and 3, simulated in chapter 4 but for figure 15.
 ";
 
 fn markers(name: &str) -> (String, String) {

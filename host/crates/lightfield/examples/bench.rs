@@ -1,7 +1,7 @@
 //! Speed of the light-field reconstruction; one JSON line for each measurement. Used by
 //! `cargo xtask bench lightfield`.
 //!
-//! Arguments: what is to be measured (`psf`, `rl`, `isra`, `dlfm`, `size`, `psf-plane`), threads, repeats, and the only case to time.
+//! Arguments: what is to be measured (`psf`, `rl`, `isra`, `dlfm`, `size`, `psf-plane`, `stream`), threads, repeats, and the only case to time.
 
 use daic_lightfield::{
     DiffractionModel, Frame, Grating, Method, Model, Normal, Operator, OperatorSettings, Order, Oversampling,
@@ -9,10 +9,49 @@ use daic_lightfield::{
 };
 use std::time::Instant;
 
-/// Seconds of processor time of this process.
+/// Seconds of processor time of this process; NaN where the system does not tell.
 fn cpu() -> f64 {
-    let t = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
-    t.tv_sec as f64 + 1e-9 * t.tv_nsec as f64
+    #[cfg(unix)]
+    {
+        let t = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+        t.tv_sec as f64 + 1e-9 * t.tv_nsec as f64
+    }
+    #[cfg(not(unix))]
+    f64::NAN
+}
+
+/// Bytes that [`stream`] reads: more than a cache holds for one thread.
+const STREAM_BYTES: usize = 64 << 20;
+/// Sums that [`stream`] keeps apart, so that additions do not wait for each other.
+const STREAM_LANES: usize = 64;
+
+/// Bytes per second that one thread reads from memory.
+fn stream(repeats: usize) {
+    let values: Vec<f32> = (0..STREAM_BYTES / 4).map(|i| (i % 7) as f32).collect();
+    let mut walls = Vec::new();
+    for _ in 0..repeats {
+        let begin = Instant::now();
+        let mut sums = [0f32; STREAM_LANES];
+        for chunk in std::hint::black_box(&values).as_chunks::<STREAM_LANES>().0 {
+            for (s, v) in sums.iter_mut().zip(chunk) {
+                *s += v;
+            }
+        }
+        std::hint::black_box(&sums);
+        walls.push(begin.elapsed().as_secs_f64());
+    }
+    let (middle, best, _) = median(walls);
+    let rate = |seconds: f64| 1e-9 * STREAM_BYTES as f64 / seconds;
+    println!("{{\"case\":\"stream\",\"gb_s\":{:.2},\"gb_s_best\":{:.2}}}", rate(middle), rate(best));
+}
+
+/// A number in JSON, which has no NaN.
+fn json(v: f64) -> String {
+    if v.is_finite() { format!("{v:.6}") } else { "null".into() }
+}
+
+fn list(v: &[f64]) -> String {
+    format!("[{}]", v.iter().map(|v| json(*v)).collect::<Vec<_>>().join(","))
 }
 
 fn median(mut v: Vec<f64>) -> (f64, f64, f64) {
@@ -92,20 +131,21 @@ fn time(case: &Case<'_>, repeats: usize) {
             first_cpus.push((b - a) / (marks.len() - 1) as f64);
         }
     }
-    let ((cpu_s, low, high), (wall, ..)) = (median(cpus), median(walls));
-    let (each, ..) = median(if first_cpus.is_empty() { vec![f64::NAN] } else { first_cpus });
     let memory = m.operator.memory();
     let bytes = m.normal.as_ref().map_or(memory.blocks, Normal::bytes);
     println!(
-        "{{\"case\":\"{}\",\"threads\":{},\"cpu\":{cpu_s:.6},\"cpu_low\":{low:.6},\"cpu_high\":{high:.6},\"wall\":{wall:.6},\"iteration_cpu\":{each:.6},\"iterations\":{},\"block_bytes\":{bytes},\"peak_bytes\":{},\"reduction\":\"{:?}\",\"grid\":[{},{}],\"build_cpu\":{:.4}}}",
+        "{{\"case\":\"{}\",\"threads\":{},\"cpu\":{},\"wall\":{},\"iteration_cpu\":{},\"iterations\":{},\"block_bytes\":{bytes},\"peak_bytes\":{},\"reduction\":\"{:?}\",\"grid\":[{},{}],\"build_cpu\":{}}}",
         case.name,
         rayon::current_num_threads(),
+        list(&cpus),
+        list(&walls),
+        list(&first_cpus),
         case.settings.iterations,
         memory.peak(),
         m.normal.as_ref().map_or(memory.reduction, Normal::reduction),
         memory.grid[0],
         memory.grid[1],
-        case.build,
+        json(case.build),
     );
 }
 
@@ -128,15 +168,16 @@ fn run(what: &str, repeats: usize) {
         "psf" => {
             for (name, grating) in [("psf", None), ("psf-dlfm", Some(plus))] {
                 let seconds = psf(grating).1;
-                println!("{{\"case\":\"{name}\",\"cpu\":{seconds:.4},\"planes\":17}}");
+                println!("{{\"case\":\"{name}\",\"cpu\":{},\"planes\":17}}", json(seconds));
             }
         }
+        "stream" => stream(repeats),
         "psf-plane" => {
             // one plane at sufficient sampling, 75 samples a lenslet as the peer at Nnum 75
             let p = PsfParameters { planes_um: vec![20.0], ..parameters(None) };
             let before = cpu();
             Psf::compute(&p).expect("the published microscope");
-            println!("{{\"case\":\"psf-plane\",\"cpu\":{:.4},\"planes\":1}}", cpu() - before);
+            println!("{{\"case\":\"psf-plane\",\"cpu\":{},\"planes\":1}}", json(cpu() - before));
         }
         "rl" | "isra" | "dlfm" => {
             let dlfm = what == "dlfm";
@@ -188,7 +229,7 @@ fn run(what: &str, repeats: usize) {
             let peak = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
             let peak = peak.lines().find_map(|l| l.strip_prefix("VmHWM:"));
             let kib: f64 = peak.and_then(|v| v.split_whitespace().next()?.parse().ok()).unwrap_or(f64::NAN);
-            println!("{{\"case\":\"size-memory\",\"peak_mib\":{:.0}}}", kib / 1024.0);
+            println!("{{\"case\":\"size-memory\",\"peak_mib\":{}}}", json((kib / 1024.0).round()));
         }
         other => eprintln!("nothing is called `{other}`"),
     }

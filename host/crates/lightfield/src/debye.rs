@@ -6,7 +6,7 @@ use crate::optics::Objective;
 use rayon::prelude::*;
 use rustfft::num_complex::Complex64;
 
-/// Nodes and weights of the 16-point Gauss–Legendre rule on [−1, 1].
+/// Nodes and weights of the Gauss–Legendre rule of `n` points on [−1, 1].
 pub(crate) fn gauss_legendre(n: usize) -> Vec<(f64, f64)> {
     (0..n)
         .map(|i| {
@@ -28,6 +28,11 @@ pub(crate) fn gauss_legendre(n: usize) -> Vec<(f64, f64)> {
             (x, 2.0 / ((1.0 - x * x) * slope * slope))
         })
         .collect()
+}
+
+/// The largest of values that are not negative; NaN if any is, so that it does not count as settled.
+fn largest(values: impl Iterator<Item = f64>) -> f64 {
+    values.fold(0.0, |a, b| if a.is_nan() || b <= a { a } else { b })
 }
 
 /// Points of the rule in each panel.
@@ -88,17 +93,13 @@ pub fn debye_integral(
     let mut coarse = sums(objective, &probes, depths, panels);
     loop {
         let fine = sums(objective, &probes, depths, 2 * panels);
-        let error = coarse
-            .iter()
-            .flatten()
-            .zip(fine.iter().flatten())
-            .map(|(a, b)| (a - b).norm())
-            .fold(0.0, f64::max);
+        let error = largest(coarse.iter().flatten().zip(fine.iter().flatten()).map(|(a, b)| (a - b).norm()));
         if error <= QUADRATURE_ERROR {
             return Ok((sums(objective, radii, depths, panels), error));
         }
         panels *= 2;
-        if 2 * panels * RULE > MOST_NODES {
+        // more nodes do not mend what is not a number
+        if error.is_nan() || 2 * panels * RULE > MOST_NODES {
             return Err(PsfError::Quadrature { error, nodes: 2 * panels * RULE });
         }
         coarse = fine;
@@ -216,9 +217,9 @@ pub fn pupil_field(
     xs: &[f64],
     ys: &[f64],
 ) -> Result<(Vec<Complex64>, f64), PsfError> {
-    let spacing = 0.5 * objective.wavelength_um / objective.na / LATTICE_OVERSAMPLING;
-    let lattices = [xs, ys].map(|v| Lattice::over(v, spacing));
-    let [lx, ly] = &lattices;
+    let spacing = 0.5 * objective.wavelength_um / objective.na / INTERPOLATION_OVERSAMPLING;
+    let interpolations = [xs, ys].map(|v| Interpolation::over(v, spacing));
+    let [lx, ly] = &interpolations;
     let (xs, ys) = (lx.as_ref().map_or(xs, |l| &l.nodes), ly.as_ref().map_or(ys, |l| &l.nodes));
     let k0 = std::f64::consts::TAU / objective.wavelength_um;
     let far = |v: &[f64]| v.iter().fold(0.0f64, |a, x| a.max(x.abs()));
@@ -230,7 +231,7 @@ pub fn pupil_field(
         other => other.to_vec(),
     };
     let (px, py) = (ends(xs), ends(ys));
-    let largest = |v: &[Complex64]| v.iter().map(|c| c.norm()).fold(0.0, f64::max);
+    let largest = |v: &[Complex64]| largest(v.iter().map(|c| c.norm()));
     loop {
         let (mut coarse, _) = pupil_sum(objective, q, z, &px, &py, nodes);
         let (fine, _) = pupil_sum(objective, q, z, &px, &py, nodes * 3 / 2);
@@ -250,7 +251,7 @@ pub fn pupil_field(
             }
             return Ok((field, evanescent));
         }
-        if nodes > 12_000 {
+        if error.is_nan() || nodes > 12_000 {
             return Err(PsfError::Quadrature { error, nodes });
         }
         nodes *= 2;
@@ -258,29 +259,29 @@ pub fn pupil_field(
 }
 
 /// Nodes a period of the highest frequency that the pupil passes, over the two that suffice in principle.
-const LATTICE_OVERSAMPLING: f64 = 1.6;
+const INTERPOLATION_OVERSAMPLING: f64 = 1.6;
 /// Nodes to either side that take part in an interpolation.
-const LATTICE_REACH: usize = 14;
+const INTERPOLATION_REACH: usize = 14;
 
 /// Equidistant nodes, and how positions are interpolated between them by a sinc in a Kaiser window. The pupil
 /// limits the field's frequencies to NA/λ, so that what is finer than that need not be integrated; the
 /// window's stop band, exp(−π reach (1 − 1/oversampling)), is 7e-8.
-struct Lattice {
+struct Interpolation {
     nodes: Vec<f64>,
     /// First node and weights of every position.
-    taps: Vec<(usize, [f64; 2 * LATTICE_REACH])>,
+    taps: Vec<(usize, [f64; 2 * INTERPOLATION_REACH])>,
 }
 
-impl Lattice {
+impl Interpolation {
     /// Nodes for positions that are denser than `spacing`; none where there is nothing to gain.
     fn over(positions: &[f64], spacing: f64) -> Option<Self> {
         let (&first, &last) = (positions.first()?, positions.last()?);
-        let count = ((last - first) / spacing).ceil() as usize + 2 * LATTICE_REACH;
+        let count = ((last - first) / spacing).ceil() as usize + 2 * INTERPOLATION_REACH;
         if positions.len() < count + count / 4 {
             return None;
         }
-        let reach = LATTICE_REACH as f64;
-        let beta = std::f64::consts::PI * reach * (1.0 - 1.0 / LATTICE_OVERSAMPLING);
+        let reach = INTERPOLATION_REACH as f64;
+        let beta = std::f64::consts::PI * reach * (1.0 - 1.0 / INTERPOLATION_OVERSAMPLING);
         let weight = |t: f64| {
             let inside = (1.0 - (t / reach).powi(2)).max(0.0);
             let angle = std::f64::consts::PI * t;
@@ -294,7 +295,7 @@ impl Lattice {
             .map(|x| {
                 let place = (x - first) / spacing;
                 let cell = place.floor();
-                let mut weights = [0.0; 2 * LATTICE_REACH];
+                let mut weights = [0.0; 2 * INTERPOLATION_REACH];
                 for (j, w) in weights.iter_mut().enumerate() {
                     *w = weight(place - cell - (j as f64 + 1.0 - reach));
                 }
@@ -447,4 +448,22 @@ fn gauss_legendre_cached(nodes: usize) -> Vec<(f64, f64)> {
             rule.iter().map(move |&(x, w)| (middle + half * x, half * w)).collect::<Vec<_>>()
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_a_number_does_not_settle() {
+        assert_eq!(largest([0.5, 2.0, 1.0].into_iter()), 2.0);
+        for values in [[f64::NAN, 1.0], [1.0, f64::NAN]] {
+            assert!(largest(values.into_iter()).is_nan());
+        }
+        let objective = Objective { magnification: 20.0, na: 0.5, index: 1.0, wavelength_um: 0.45 };
+        let refused = debye_integral(&objective, &[0.0, 1.0], &[f64::NAN]);
+        assert!(matches!(refused, Err(PsfError::Quadrature { error, .. }) if error.is_nan()));
+        let refused = pupil_field(&objective, 0.0, f64::NAN, &[0.0], &[0.0]);
+        assert!(matches!(refused, Err(PsfError::Quadrature { error, .. }) if error.is_nan()));
+    }
 }

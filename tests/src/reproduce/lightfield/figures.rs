@@ -1,8 +1,8 @@
 //! What is reconstructed and measured for each figure of chapter 4.
 
 use super::{
-    Angle, BEAD, Boxed, Camera, Condition, Convergence, Data, ITERATIONS, Models, Optics, PUPIL, Results,
-    Run, SEVEN, VIRTUAL, View, Widths,
+    Angle, BEAD, Boxed, Camera, Condition, Convergence, Data, Disturbance, FAR_UM, ITERATIONS, Models,
+    Optics, PUPIL, Results, Run, SEVEN, VIRTUAL, View, Widths,
 };
 use crate::reproduce::{Extent, ReproduceError};
 
@@ -63,15 +63,45 @@ pub(super) fn conditions(both: [(&View, &Data); 2], results: &mut Results) -> Re
         (21, "SNR 100", 0, 20.0, noisy(100.0)),
         (21, "SNR 20", 0, 20.0, noisy(20.0)),
     ];
+    let clean =
+        |(view, data): (&View, &Data)| view.reconstruct(&Camera::GOOD.take(&data.images[0], 3), ITERATIONS);
+    let clean = [clean(both[0])?, clean(both[1])?];
     for (figure, name, scene, z_um, camera) in list {
-        let measure = |(view, data): (&View, &Data)| -> Result<Widths, ReproduceError> {
+        let centre = [0.0, 0.0, z_um];
+        let measure = |k: usize| -> Result<(Widths, Disturbance), ReproduceError> {
+            let (view, data) = both[k];
             let volume = view.reconstruct(&camera.take(&data.images[scene], 3), ITERATIONS)?;
-            Ok(view.widths(&volume, [0.0, 0.0, z_um]))
+            // volumes are in the camera's numbers
+            let full = |c: &Camera| ((1u32 << c.bits) - 1) as f32;
+            let factor = full(&Camera::GOOD) / full(&camera);
+            let scaled: Vec<f32> = volume.iter().map(|v| v * factor).collect();
+            let distance = distance(&scaled, &clean[k]);
+            let outside = outside(view, &volume, centre);
+            Ok((view.widths(&volume, centre), Disturbance { distance, outside }))
         };
-        let (virtual_point, pupil) = (measure(both[0])?, measure(both[1])?);
-        results.conditions.push(Condition { figure, name, z_um, virtual_point, pupil });
+        let ((virtual_point, one), (pupil, other)) = (measure(0)?, measure(1)?);
+        let disturbance = (scene == 0 && figure != 18).then_some([one, other]);
+        results.conditions.push(Condition { figure, name, z_um, virtual_point, pupil, disturbance });
     }
     Ok(())
+}
+
+/// Largest value farther than [`FAR_UM`] from a place, relative to the largest of all.
+fn outside(view: &View, volume: &[f32], centre: [f64; 3]) -> f64 {
+    let [_, ny, nx] = view.shape();
+    let [dz, dx] = view.voxel_um();
+    let (mut far, mut all) = (0f32, f32::MIN_POSITIVE);
+    for (i, v) in volume.iter().enumerate() {
+        let (x, y, z) = (i % nx, i / nx % ny, i / (nx * ny));
+        let at = |i: usize, n: usize| (i as f64 + 0.5 - 0.5 * n as f64) * dx;
+        let place = [at(x, nx), at(y, ny), view.first_um() + z as f64 * dz];
+        let square: f64 = place.iter().zip(centre).map(|(p, c)| (p - c).powi(2)).sum();
+        all = all.max(*v);
+        if square > FAR_UM * FAR_UM {
+            far = far.max(*v);
+        }
+    }
+    f64::from(far / all)
 }
 
 /// ‖a − b‖/‖b‖.

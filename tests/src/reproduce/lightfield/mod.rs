@@ -18,6 +18,8 @@ use std::path::Path;
 
 /// Iterations of Richardson–Lucy, as in the thesis.
 pub const ITERATIONS: usize = 8;
+/// Distance from a bead's centre beyond which light is noise, µm: the beads' diameter.
+pub const FAR_UM: f64 = BEAD_UM;
 /// Wavelength, µm.
 const WAVELENGTH_UM: f64 = 0.45;
 const VIRTUAL: DiffractionModel = DiffractionModel::Virtual;
@@ -87,6 +89,18 @@ pub struct Condition {
     pub virtual_point: Widths,
     /// With the exact phase.
     pub pupil: Widths,
+    /// What the camera does to the volumes with `virtual` and `pupil`; none of figure 18, which has no other to
+    /// compare with.
+    pub disturbance: Option<[Disturbance; 2]>,
+}
+
+/// A volume beside that of the same images with 16 bits and without noise.
+#[derive(Debug, Clone, Copy)]
+pub struct Disturbance {
+    /// ‖g − g₀‖/‖g₀‖.
+    pub distance: f64,
+    /// Largest value farther than [`FAR_UM`] from the bead's centre, relative to the largest of all.
+    pub outside: f64,
 }
 
 /// Everything that chapter 4 gives.

@@ -1,7 +1,7 @@
 //! The page of chapter 4 and its figures.
 
 use super::summary::summary;
-use super::{Boxed, Convergence, ITERATIONS, Models, RADII, Results, SEVEN, Widths};
+use super::{Boxed, Condition, Convergence, FAR_UM, ITERATIONS, Models, RADII, Results, SEVEN, Widths};
 use crate::reproduce::ReproduceError;
 use crate::reproduce::document::{Part, row_of, table};
 use crate::reproduce::pictures::chart;
@@ -27,7 +27,7 @@ const LEFT_OUT: &str = "### What the simulation simplifies
 - Images are simulated on finer voxels, planes and fields than reconstructions use: five voxels a lenslet (1.5 µm), planes 2 µm apart and five field samples a pixel (2 µm at the lenslets) against three voxels
   (2.5 µm), planes 2.5 µm apart and four samples (2.5 µm). Voxels are points (the thesis smears them over three, (4.7)). What finer fields would change is in the table of point spread functions.
 - Images have planes only within 7 µm of a bead's centre; elsewhere there is nothing to see.
-- Point spread functions end at a radius in lenslets. With `virtual` the radii hold what there is. With `pupil` no radius does: at NA 0.5 and 30° the pupil takes emission angles from 0° to 90°, and
+- Point spread functions end at a radius in lenslets. VIRTUAL With `pupil` no radius does at 30° and 45°: at NA 0.5 and 30° the pupil takes emission angles from 0° to 90°, and
   what leaves at grazing angles lands tens of lenslets away. The images' radius is larger than the reconstruction's, so that the reconstruction meets light that it does not know; what lies beyond
   the images' radius is missing in both. The row with a reconstruction of larger radius shows what the smaller one costs.
 - Beads emit alike in all directions and scatter nothing; the grating has no zero order and no second order in the views. Noise is added where the text says so.
@@ -43,6 +43,28 @@ fn cells(w: &Widths) -> Vec<String> {
 
 fn model(m: Option<DiffractionModel>) -> String {
     m.map_or("–".to_owned(), |m| format!("`{}`", format!("{m:?}").to_lowercase()))
+}
+
+/// What the radii of the virtual point's spread functions hold.
+fn held_by_virtual(results: &Results) -> String {
+    let short: Vec<String> = results
+        .psfs
+        .iter()
+        .filter(|(what, energy, _)| what.contains(", virtual,") && *energy < 0.99)
+        .map(|(what, energy, _)| format!("{what} ({:.0} %)", 100.0 * energy))
+        .collect();
+    if short.is_empty() {
+        return "With `virtual` the radii hold 99 % and more of every plane's light.".into();
+    }
+    let short = short.join("; ");
+    format!(
+        "With `virtual` the radii hold 99 % and more of every plane's light, but for: {short}, whose deepest planes lack light (next table)."
+    )
+}
+
+/// Share of its peak that the first plane, the focal one, holds of a condition's bead: `virtual`, `pupil`.
+pub(super) fn left_in_focus(c: &Condition) -> [f64; 2] {
+    [&c.virtual_point, &c.pupil].map(|w| axial(w, 0.0).first().map_or(f64::NAN, |p| p.1))
 }
 
 /// Profile along z, its largest value 1, moved by `origin`.
@@ -78,7 +100,7 @@ pub fn part(results: &Results) -> Result<Part, ReproduceError> {
     convergence(results, &mut text, &mut figures)?;
     real(results, &mut text, &mut figures)?;
     if !results.light.is_empty() {
-        text.push_str(LEFT_OUT);
+        text.push_str(&LEFT_OUT.replace("VIRTUAL", &held_by_virtual(results)));
         text.push('\n');
     }
     light(results, &mut text);
@@ -257,7 +279,7 @@ fn conditions(results: &Results, text: &mut String, figures: &mut Figures) -> Re
     let shown: Vec<(&str, &str)> = shown.iter().map(|(a, b)| (a.as_str(), *b)).collect();
     text.push_str(&row_of(&shown));
     let first = results.conditions.iter().find(|c| c.figure == 18);
-    let left = first.and_then(|c| axial(&c.virtual_point, 0.0).first().copied()).map_or(f64::NAN, |p| p.1);
+    let [left, _] = first.map_or([f64::NAN; 2], left_in_focus);
     writeln!(
         text,
         "Of the bead at 7.5 µm {:.0} % of the peak are left in the focal plane, where the lenslets hold no depth; its half width does not show that. Planes are 2.5 µm apart: some tenths of a micrometre mean nothing.",
@@ -265,6 +287,22 @@ fn conditions(results: &Results, text: &mut String, figures: &mut Figures) -> Re
     )
     .ok();
     text.push_str("Curves: `virtual`. SNR: largest value of the images over the noise's σ, which is the same on every pixel; negative pixels are cut to 0.\n\n");
+    let rows: Vec<Vec<String>> = results
+        .conditions
+        .iter()
+        .filter_map(|c| {
+            let percent = |v: f64| format!("{:.1}", 100.0 * v);
+            let cells = c.disturbance?.map(|d| [percent(d.distance), percent(d.outside)]).concat();
+            Some([vec![format!("{}: {}", c.figure, c.name)], cells].concat())
+        })
+        .collect();
+    let head = ["figure", "`virtual`: distance, %", "outside, %", "`pupil`: distance, %", "outside, %"];
+    text.push_str(&table(&head, &rows));
+    writeln!(
+        text,
+        "\nWhat bits and noise do to the volume. *Distance*: ‖g − g₀‖/‖g₀‖ to the volume g₀ of 16 bits without noise. *Outside*: largest voxel farther than {FAR_UM:.0} µm from the bead's centre, of the peak.\n"
+    )
+    .ok();
     Ok(())
 }
 
