@@ -10,7 +10,8 @@ use prefetch_index::prefetch_index;
 
 /// Vectors that one call takes.
 pub(crate) const VECTORS: usize = 8;
-/// How far ahead of its use storage is asked for, in bytes; from 2 to 8 KiB are equally good.
+/// How far ahead of its use storage is asked for, in bytes; from 2 to 8 KiB are equally good. A product of blocks
+/// of 31 MiB takes a fifth less time with it (docs/performance.md).
 const AHEAD: usize = 4096;
 /// Columns between two requests.
 const GROUP: usize = 4;
