@@ -1,38 +1,16 @@
 //! Reconstructions against their formulas written out, on small random point spread functions.
 
 mod common;
-use common::{Case, random, relative, symmetric};
+use common::{Case, SMALL, model, random, relative, symmetric, up};
 use daic_lightfield::{
-    Direct, Frame, Method, Model, Normal, Operator, OperatorSettings, Path, Psf, Reconstruction, Reduction,
-    Settings, Storage, native_widths, reconstruct,
+    Direct, Frame, Method, Model, OperatorSettings, Path, Reconstruction, Reduction, Settings, Storage,
+    reconstruct,
 };
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-const CASE: Case = Case {
-    pixels: [5, 5],
-    voxels: [3, 3],
-    planes: 3,
-    radius: 1,
-    cells: [5, 6],
-    margin: 0,
-    symmetry: Reduction::RealSquare,
-};
+const CASE: Case = Case { planes: 3, cells: [5, 6], ..SMALL };
 const ITERATIONS: usize = 3;
-
-fn model(psf: &Psf, settings: &OperatorSettings, orders: usize, normal: bool) -> Model {
-    Model {
-        operator: Operator::new(psf, settings).unwrap(),
-        orders,
-        normal: normal.then(|| Normal::new(psf, settings.cells, settings.storage, orders).unwrap()),
-        voxel_um: [5.0, 2.5, 2.5],
-        widths: native_widths(&psf.parameters),
-    }
-}
-
-fn up(v: &[f32]) -> Vec<f64> {
-    v.iter().map(|&v| f64::from(v)).collect()
-}
 
 /// Rows of `width` numbers, each turned round.
 fn mirrored<T: Copy>(v: &[T], width: usize) -> Vec<T> {

@@ -1,7 +1,7 @@
 //! Projections against independent arrays and against themselves.
 
 mod common;
-use common::{Case, f32s, f64s, psf_of, random, relative, shared, symmetric};
+use common::{Case, SMALL, f32s, f64s, psf_of, random, relative, shared, symmetric};
 use daic_lightfield::{Direct, Operator, OperatorSettings, Reduction, Storage};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -10,36 +10,25 @@ fn dot(a: &[f32], b: &[f32]) -> f64 {
     a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
 }
 
-const CASES: [Case; 9] = {
-    let base = Case {
-        pixels: [5, 5],
-        voxels: [3, 3],
-        planes: 2,
-        radius: 1,
-        cells: [4, 4],
-        margin: 0,
-        symmetry: Reduction::RealSquare,
-    };
-    [
-        base,
-        Case { cells: [7, 5], margin: 1, ..base },
-        Case { pixels: [6, 6], voxels: [2, 2], radius: 2, cells: [6, 9], ..base },
-        Case { symmetry: Reduction::RealMirrors, pixels: [4, 7], voxels: [2, 3], cells: [3, 8], ..base },
-        Case { symmetry: Reduction::Real, pixels: [7, 4], voxels: [1, 2], margin: 2, radius: 2, ..base },
-        Case { symmetry: Reduction::ComplexMirrorY, planes: 3, margin: -1, cells: [6, 5], ..base },
-        Case { symmetry: Reduction::ComplexMirrorX, pixels: [5, 6], voxels: [3, 2], cells: [5, 7], ..base },
-        Case { symmetry: Reduction::Complex, pixels: [3, 9], voxels: [2, 1], planes: 5, margin: 1, ..base },
-        Case {
-            symmetry: Reduction::Complex,
-            pixels: [2, 3],
-            voxels: [1, 1],
-            planes: 1,
-            radius: 0,
-            cells: [1, 1],
-            ..base
-        },
-    ]
-};
+const CASES: [Case; 9] = [
+    SMALL,
+    Case { cells: [7, 5], margin: 1, ..SMALL },
+    Case { pixels: [6, 6], voxels: [2, 2], radius: 2, cells: [6, 9], ..SMALL },
+    Case { symmetry: Reduction::RealMirrors, pixels: [4, 7], voxels: [2, 3], cells: [3, 8], ..SMALL },
+    Case { symmetry: Reduction::Real, pixels: [7, 4], voxels: [1, 2], margin: 2, radius: 2, ..SMALL },
+    Case { symmetry: Reduction::ComplexMirrorY, planes: 3, margin: -1, cells: [6, 5], ..SMALL },
+    Case { symmetry: Reduction::ComplexMirrorX, pixels: [5, 6], voxels: [3, 2], cells: [5, 7], ..SMALL },
+    Case { symmetry: Reduction::Complex, pixels: [3, 9], voxels: [2, 1], planes: 5, margin: 1, ..SMALL },
+    Case {
+        symmetry: Reduction::Complex,
+        pixels: [2, 3],
+        voxels: [1, 1],
+        planes: 1,
+        radius: 0,
+        cells: [1, 1],
+        ..SMALL
+    },
+];
 
 /// Every reduction, odd and even sizes, margins: as the plain sums, and the exact adjoint.
 #[test]
@@ -75,7 +64,8 @@ fn projections_are_those_of_the_plain_sums() {
                 let (a, b) = (dot(&hg[i], &f[i]), dot(&g[i], &htf[i]));
                 println!("{:?} {storage:?} {forward:.1e} {back:.1e} {:.1e}", case.symmetry, a / b - 1.0);
                 assert!(forward < limit && back < limit, "{case:?} {storage:?} {forward:e} {back:e}");
-                assert!((a / b - 1.0).abs() < 1e-6, "{case:?} {storage:?} {a} {b}");
+                // 1.5e-7 is the worst measured
+                assert!((a / b - 1.0).abs() < 2e-7, "{case:?} {storage:?} {a} {b}");
             }
         }
     }
@@ -116,7 +106,8 @@ fn tiles_give_the_same() {
             let up = |v: &[f32]| v.iter().map(|&v| f64::from(v)).collect::<Vec<_>>();
             let error = relative(up(&b[0]), up(&a[0]));
             println!("{margin} {symmetry:?} {:?} {error:.1e}", memory.tile);
-            assert!(error < 1e-6, "{error:e}");
+            // 1.5e-7 is the worst measured, of tiles
+            assert!(error < 2e-7, "{error:e}");
         }
     }
     let psf = symmetric(&mut rng, &CASES[0]);
@@ -139,7 +130,8 @@ fn golden_projections() {
         let truth = f64s(dir.join(forward));
         let error = relative(image.iter().map(|&v| f64::from(v)), truth.iter().copied());
         println!("{file} {:?} {error:.1e}", operator.memory().reduction);
-        assert!(error < 1e-6, "{error:e}");
+        // 1.2e-7 is the worst measured
+        assert!(error < 2e-7, "{error:e}");
         if radius == 3 {
             assert_eq!(operator.memory().reduction, Reduction::RealSquare);
             let image: Vec<f32> = truth.iter().map(|&v| v as f32).collect();
@@ -147,7 +139,8 @@ fn golden_projections() {
             let truth = volume_of(&f64s(dir.join("backproj_of_forward_f64.npy")));
             let error = relative(back.iter().map(|&v| f64::from(v)), truth);
             println!("back {error:.1e}");
-            assert!(error < 1e-6, "{error:e}");
+            // 2.4e-7 measured
+            assert!(error < 3e-7, "{error:e}");
         } else {
             assert_eq!(operator.memory().reduction, Reduction::ComplexMirrorY);
         }

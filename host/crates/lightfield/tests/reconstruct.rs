@@ -1,10 +1,10 @@
 //! Reconstructions against independent arrays and their own laws.
 
 mod common;
-use common::{f32s, f64s, relative, shared, u16s};
+use common::{f32s, f64s, model, relative, shared, u16s, up};
 use daic_lightfield::{
     Frame, Method, Model, Normal, Operator, OperatorSettings, Oversampling, Path, Psf, PsfParameters,
-    PsfReport, Radius, ReconstructError, Reconstruction, Settings, Storage, native_widths, reconstruct,
+    PsfReport, Radius, ReconstructError, Reconstruction, Settings, Storage, reconstruct,
 };
 
 fn golden_psf(name: &str, radius: usize) -> Option<Psf> {
@@ -26,16 +26,6 @@ fn golden_psf(name: &str, radius: usize) -> Option<Psf> {
     Some(Psf::from_values(parameters, report, radius, f32s(dir.join(name))).unwrap())
 }
 
-fn model(psf: &Psf, settings: &OperatorSettings, orders: usize, normal: bool) -> Model {
-    Model {
-        operator: Operator::new(psf, settings).unwrap(),
-        orders,
-        normal: normal.then(|| Normal::new(psf, settings.cells, settings.storage, orders).unwrap()),
-        voxel_um: [5.0, 2.5, 2.5],
-        widths: native_widths(&psf.parameters),
-    }
-}
-
 fn image(name: &str) -> Vec<f32> {
     let dir = shared("reconstruct", "golden/lightfield").unwrap();
     f64s(dir.join(name)).iter().map(|&v| v as f32).collect()
@@ -52,10 +42,6 @@ fn run(model: &Model, images: Vec<&[f32]>, settings: &Settings) -> (Reconstructi
     let frame = Frame { images, ..Frame::default() };
     let (mut out, path) = reconstruct(model, &[frame], settings, None, &mut |_| true).unwrap();
     (out.remove(0), path)
-}
-
-fn up(v: &[f32]) -> Vec<f64> {
-    v.iter().map(|&v| f64::from(v)).collect()
 }
 
 #[test]
@@ -82,7 +68,8 @@ fn golden_reconstructions() {
                 m.operator.memory().tile,
                 out.residuals
             );
-            assert!(error < 1e-5, "{error:e}");
+            // 1.0e-6 is the worst measured, of f32 sums over 8 iterations
+            assert!(error < 1.4e-6, "{error:e}");
         }
     }
 }
@@ -104,7 +91,8 @@ fn golden_reconstructions_of_two_orders() {
             let (out, _) = run(m, vec![&plus, &minus], &Settings::new(method, 8));
             let error = relative(up(&out.state.volume), truth(name));
             println!("{name} {error:.1e}");
-            assert!(error < 1e-5, "{error:e}");
+            // 1.7e-6 is the worst measured
+            assert!(error < 2.2e-6, "{error:e}");
         }
     }
 }
@@ -138,7 +126,8 @@ fn the_normal_matrix_does_the_same() {
         assert_eq!(path, Path::TwoPasses { reason: None });
         let error = relative(up(&one.state.volume), up(&two.state.volume));
         println!("{name} {orders} {:?} {error:.1e}", m.normal.as_ref().map(Normal::reduction));
-        assert!(error < 2e-5, "{error:e}");
+        // 5.2e-7 is the worst measured
+        assert!(error < 8e-7, "{error:e}");
         // a cropped sensor is told
         let cropped = Model { operator: Operator::new(&psf, &OperatorSettings::new([5, 6])).unwrap(), ..m };
         let small = vec![vec![1f32; cropped.operator.image_shape().iter().product()]; orders];

@@ -1,7 +1,10 @@
 //! Shared data and comparisons.
 #![allow(dead_code)] // each test binary uses its own part
 
-use daic_lightfield::{Oversampling, Psf, PsfParameters, PsfReport, Radius, Reduction};
+use daic_lightfield::{
+    Model, Normal, Operator, OperatorSettings, Oversampling, Psf, PsfParameters, PsfReport, Radius,
+    Reduction, native_widths,
+};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use std::path::PathBuf;
@@ -94,6 +97,17 @@ pub struct Case {
     pub symmetry: Reduction,
 }
 
+/// The smallest case worth the name; others differ from it.
+pub const SMALL: Case = Case {
+    pixels: [5, 5],
+    voxels: [3, 3],
+    planes: 2,
+    radius: 1,
+    cells: [4, 4],
+    margin: 0,
+    symmetry: Reduction::RealSquare,
+};
+
 pub fn random(rng: &mut ChaCha8Rng, n: usize) -> Vec<f32> {
     (0..n).map(|_| rng.random_range(0.0..1.0)).collect()
 }
@@ -136,4 +150,19 @@ pub fn symmetric(rng: &mut ChaCha8Rng, case: &Case) -> Psf {
         }
     }
     psf_of(case.pixels, case.voxels, case.planes, case.radius, values)
+}
+
+/// A model of a point spread function; with its normal matrix if `normal`.
+pub fn model(psf: &Psf, settings: &OperatorSettings, orders: usize, normal: bool) -> Model {
+    Model {
+        operator: Operator::new(psf, settings).unwrap(),
+        orders,
+        normal: normal.then(|| Normal::new(psf, settings.cells, settings.storage, orders).unwrap()),
+        voxel_um: [5.0, 2.5, 2.5],
+        widths: native_widths(&psf.parameters),
+    }
+}
+
+pub fn up(v: &[f32]) -> Vec<f64> {
+    v.iter().map(|&v| f64::from(v)).collect()
 }
